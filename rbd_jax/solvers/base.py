@@ -1,0 +1,75 @@
+"""Layer 5: what a contact solver receives and returns."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import ClassVar
+
+import jax
+
+from ..bodies import Inertia
+from ..spatial import Quat, Vec3
+from ..struct import struct
+from .rows import Impulses, InverseInertia, Rows
+
+
+@struct
+class Problem:
+    """One velocity-level contact problem; every body array is (n, B) or (n, 1).
+
+    Attributes:
+      rows: groups of contact rows (at least one).
+      v0, w0: velocities at the start of the step [m/s, rad/s].
+      v, w: predicted velocities v* = v0 + h a, w* (all but the contact forces applied).
+        w0 and w are None when the scene carries no attitude (then no row has an angular part).
+      inv_mass: [1/kg]. inertia, q: principal inertia and attitude. inv_inertia: world R I^-1 R^T.
+      h: step [s], scalar or (B,).
+      warm: impulses to start from, one entry a group, already zero where a contact is new.
+      one: an array equal to 1 that XLA cannot see through, see ``rbd_jax.xla.materialise``.
+    """
+
+    rows: tuple[Rows, ...]
+    v0: Vec3
+    v: Vec3
+    inv_mass: jax.Array
+    h: jax.Array
+    warm: tuple[Impulses, ...]
+    one: jax.Array
+    w0: Vec3 | None = None
+    w: Vec3 | None = None
+    q: Quat | None = None
+    inertia: Inertia | None = None
+    inv_inertia: InverseInertia | None = None
+
+
+@struct
+class Solution:
+    """What the contacts do in this step.
+
+    Attributes:
+      impulse: total contact impulse on every body [N s], (n, B).
+      angular_impulse: about its centre of mass [N m s], (n, B); None without attitude.
+      contacts: impulses per group and slot.
+      v_move, w_move: velocities that move the poses in this step where they differ from the
+        end-of-step velocities (position bias), else None.
+      unconverged: bool (B,) or None.
+    """
+
+    impulse: Vec3
+    contacts: tuple[Impulses, ...]
+    angular_impulse: Vec3 | None = None
+    v_move: Vec3 | None = None
+    w_move: Vec3 | None = None
+    unconverged: jax.Array | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Solver:
+    """A contact solver: a frozen (hashable, static) dataclass of its iteration counts and constants."""
+
+    name: ClassVar[str]
+    #: "velocity": solves for end-of-step velocities; "force": gives forces at the given state
+    level: ClassVar[str] = "velocity"
+
+    def solve(self, problem: Problem) -> Solution:
+        raise NotImplementedError

@@ -1,0 +1,152 @@
+"""Layer 5: contact rows, the one language between contact geometry and every solver.
+
+A group of rows covers P pairs with S slots (points) each, in B worlds. For a slot with arms rA, rB
+from the centres of mass, the relative velocity at the point is
+
+    u = vB + wB x rB - (vA + wA x rA)        (A absent: u = vB + wB x rB - surface)
+
+with normal part n . u (n points from A to B) and tangential parts t1 . u, t2 . u. An impulse
+p = n pn + t1 p1 + t2 p2 acts on B at rB and -p on A at rA.
+
+When the partner is not a body (static or kinematic), the moving body is always B: the normal
+points from the partner to the body.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..spatial import Vec3, tangent_basis
+from ..struct import static, struct
+
+
+class Index:
+    """Rows of the body axis that a group touches: fixed for all worlds (numpy) and hashable."""
+
+    def __init__(self, rows):
+        self.rows = np.asarray(rows, np.int32)
+        self._hash = hash(self.rows.tobytes())
+
+    def __hash__(self):
+        return self._hash
+
+    def __eq__(self, other):
+        return isinstance(other, Index) and np.array_equal(self.rows, other.rows)
+
+    def __len__(self):
+        return len(self.rows)
+
+
+@struct
+class Rows:
+    """Contact rows of one group; see the module text.
+
+    Attributes:
+      a, b: body of each pair: an ``Index`` (static, (P,)) or an int32 array (P, B) that differs from
+        world to world; ``a`` is None when the partner is not a body.
+      n: unit normal from A to B, (P, B).
+      ra, rb: arms from the centre of mass to the point [m], (S, P, B).
+      phi: signed gap [m], negative = overlap, (S, P, B).
+      live: slots that hold a point, bool (S, P, B).
+      mu: friction coefficient (P, 1) or (P, B), None = frictionless (no tangential rows at all).
+      e: restitution coefficient, None = absent.
+      surface: velocity of a kinematic partner at the points [m/s], (S, P, B), None = at rest.
+      feature: manifold code for warm starting, int32 (P, B) or (1, 1).
+      law: per-pair numbers of a contact law that a solver asks for (solref, solimp, ...), or None.
+      central_a, central_b: the normal passes through that body's centre of mass (a sphere whose
+        centre it is): the normal row has no angular part.
+      colours: tuple of (start, stop) slices of the pair axis; inside one no body appears twice.
+    """
+
+    n: Vec3
+    rb: Vec3
+    phi: jax.Array
+    live: jax.Array
+    b: Index | jax.Array
+    a: Index | jax.Array | None = None
+    ra: Vec3 | None = None
+    mu: jax.Array | None = None
+    e: jax.Array | None = None
+    surface: Vec3 | None = None
+    feature: jax.Array | None = None
+    law: object = None
+    central_a: bool = static(default=False)
+    central_b: bool = static(default=False)
+    colours: tuple = static(default=())
+
+    @property
+    def tangents(self) -> tuple[Vec3, Vec3]:
+        return tangent_basis(self.n)
+
+    @property
+    def slots(self) -> int:
+        return self.phi.shape[0]
+
+
+jax.tree_util.register_static(Index)
+
+
+@struct
+class Impulses:
+    """Contact impulses of one group [N s], (S, P, B); t1 and t2 are None without friction."""
+
+    n: jax.Array
+    t1: jax.Array | None = None
+    t2: jax.Array | None = None
+
+
+@struct
+class InverseInertia:
+    """World inverse inertia R I^-1 R^T of every body [1/(kg m^2)].
+
+    Either a scalar array (n, 1 or B) for isotropic bodies, or the six entries of a symmetric matrix.
+    """
+
+    xx: jax.Array
+    yy: jax.Array | None = None
+    zz: jax.Array | None = None
+    xy: jax.Array | None = None
+    xz: jax.Array | None = None
+    yz: jax.Array | None = None
+
+    def __matmul__(self, v: Vec3) -> Vec3:
+        if self.yy is None:
+            return v * self.xx
+        return Vec3(
+            self.xx * v.x + self.xy * v.y + self.xz * v.z,
+            self.xy * v.x + self.yy * v.y + self.yz * v.z,
+            self.xz * v.x + self.yz * v.y + self.zz * v.z,
+        )
+
+    def take(self, index) -> InverseInertia:
+        return jax.tree.map(lambda c: take(c, index), self)
+
+
+def take(x: jax.Array, index) -> jax.Array:
+    """Rows of a body array (n, B or 1): (P, B or 1). No operation when the index is 0, 1, ..., n-1."""
+    if isinstance(index, Index):
+        rows = index.rows
+        if len(rows) == x.shape[0] and np.array_equal(rows, np.arange(len(rows))):
+            return x
+        if len(rows) and np.array_equal(rows, np.arange(rows[0], rows[0] + len(rows))):
+            return x[int(rows[0]) : int(rows[0]) + len(rows)]
+        return x[rows]
+    if x.shape[1] == 1:
+        return x[:, 0][index]
+    return jnp.take_along_axis(x, index, axis=0)
+
+
+def take_tree(tree, index):
+    return jax.tree.map(lambda x: take(x, index), tree)
+
+
+def add_rows(x: jax.Array, index, values: jax.Array, unique: bool = False) -> jax.Array:
+    """x with ``values`` (P, B) added at the rows of ``index``; unique: no row appears twice."""
+    if isinstance(index, Index):
+        rows = index.rows
+        if len(rows) == x.shape[0] and np.array_equal(rows, np.arange(len(rows))):
+            return x + values
+        return x.at[rows].add(values, unique_indices=unique)
+    return x.at[index, jnp.arange(x.shape[1])[None, :]].add(values)
