@@ -68,6 +68,8 @@ class Solver:
     """A contact solver: a frozen (hashable, static) dataclass of its iteration counts and constants."""
 
     name: ClassVar[str]
+    #: contact model whose numbers it takes: "soft", "near_rigid" or "mujoco"
+    contact: ClassVar[str]
     #: "velocity": solves for end-of-step velocities; "force": gives forces at the given state
     level: ClassVar[str] = "velocity"
 

@@ -1,0 +1,47 @@
+"""rbd_jax: batched, differentiable rigid-body dynamics in JAX.
+
+>>> import rbd_jax as rbd
+>>> scene = rbd.Scene(bodies=[rbd.Body("ball", rbd.Sphere(0.1), pos=(0, 0, 1))], static=[rbd.Plane()])
+>>> model, state = rbd.build(scene, method="fast")
+>>> final, traj = rbd.rollout(model, rbd.batch(state, 1024), steps=1000, every=10)
+"""
+
+from .build import build
+from .diagnostics import Contacts, SimulationError, check, contacts, energy, inertia_world, momentum, wrench_at
+from .method import PRESETS, Method
+from .model import Model
+from .rollout import rollout, step
+from .scene import Body, Geom, Pair, Scene
+from .shapes import Box, Plane, Sphere
+from .state import State, Wrench, batch
+from .status import Status
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Body",
+    "Box",
+    "Contacts",
+    "Geom",
+    "Method",
+    "Model",
+    "PRESETS",
+    "Pair",
+    "Plane",
+    "Scene",
+    "SimulationError",
+    "Sphere",
+    "State",
+    "Status",
+    "Wrench",
+    "batch",
+    "build",
+    "check",
+    "contacts",
+    "energy",
+    "inertia_world",
+    "momentum",
+    "rollout",
+    "step",
+    "wrench_at",
+]

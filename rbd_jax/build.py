@@ -1,0 +1,301 @@
+"""Layer 7: from a scene to a model (structure and numbers) and its start state.
+
+Sorts, groups, counts and decides what the program needs; everything here is numpy on the host.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .contact import NARROW
+from .method import Method, find
+from .model import Group, Model, Structure, params
+from .scene import Scene, resolve, rotation
+from .shapes import SHAPES
+from .spatial import Quat, Vec3
+from .state import Kinematic, Memory, State
+
+#: Groups with more pairs than this choose their pairs at run time (a box pair costs far more than a ball pair).
+DENSE_PAIRS = {("box", "box"): 100, ("sphere", "box"): 600, ("sphere", "sphere"): 2100}
+RANK = {shape.kind: i for i, shape in enumerate(SHAPES)}
+ISOTROPIC = 1e-9
+
+
+@dataclasses.dataclass(frozen=True)
+class Names:
+    """Names of bodies, kinematic bodies and geoms in the order of the model's arrays."""
+
+    bodies: tuple[str, ...]
+    kinematic: tuple[str, ...]
+    geoms: tuple[str, ...]
+
+
+def build(scene: Scene, dt: float | None = None, method: str | Method = "accurate") -> tuple[Model, State]:
+    """Compile a scene into a model and its start state.
+
+    Args:
+      scene: a :class:`rbd_jax.Scene` (bad scenes are refused when they are made).
+      dt: step [s], > 0; None: the scene's.
+      method: "fast", "accurate", "gradient", "mujoco", or a :class:`rbd_jax.Method`.
+
+    Returns:
+      model, state: of one world; leaves are float32, or float64 under ``jax_enable_x64``.
+
+    Raises:
+      ValueError: dt <= 0, unknown method, a combination of parts that does not exist.
+    """
+    dt = float(scene.dt if dt is None else dt)
+    if not (np.isfinite(dt) and dt > 0):
+        raise ValueError(f"build: dt = {dt} must be finite and > 0 [s]")
+    method = find(method).resolve(dt, scene.integrator)
+    r = resolve(scene)
+    dtype = jnp.result_type(float)
+    n = len(r.mass)
+
+    category = np.array(["dynamic", "kinematic", "static"])[r.geom_category]
+    kinds = np.array([s.kind for s in r.geom_shapes])
+    frames = _principal_frames(r)
+    centred = (category != "dynamic") | _near(r.geom_pos, r.com[np.maximum(r.geom_body, 0)])
+    groups = _groups(r, kinds, category, centred, method, n)
+    attitude = _needs_attitude(r, groups, kinds, category, centred)
+    if groups and method.solver.level == "velocity" and not method.integrator.contact:
+        raise ValueError(
+            f"Method: integrator '{method.integrator.name}' is for free motion; this scene has contact pairs. "
+            "Use symtop2, symtop4, buss2 or an Euler method, or a scene without pairs"
+        )
+
+    row = np.full(len(kinds), -1)
+    for kind in RANK:
+        row[kinds == kind] = np.arange((kinds == kind).sum())
+    is_static = category == "static"
+    static_row = np.where(is_static, np.cumsum(is_static) - 1, -1)
+    posed = ~is_static
+    local = posed & (~centred | ~_near(r.geom_quat, [1, 0, 0, 0]))
+    local |= (category == "kinematic") & ~_near(r.geom_pos, 0)
+    plain = not local.any() and frames.principal is None
+    has = lambda flags, values: jnp.asarray(values, dtype) if np.any(flags) else None
+    box = kinds == "box"
+    any_friction = any(g.friction for g in groups)
+    any_restitution = any(g.restitution for g in groups)
+    overrides = list(r.overrides.values())
+    own = lambda name: jnp.asarray(_override_values(overrides, name), dtype)
+    overridden = any((g.override >= 0).any() for g in groups)
+    structure = Structure(
+        n=n,
+        n_kinematic=len(r.kinematic_names),
+        names=Names(r.body_names, r.kinematic_names, r.geom_names),
+        kinds=tuple(kinds.tolist()),
+        category=tuple(category.tolist()),
+        geom_body=r.geom_body,
+        row=row,
+        static_row=static_row,
+        groups=groups,
+        attitude=attitude,
+        isotropic=frames.isotropic,
+        axis_shift=frames.shift if attitude and not frames.isotropic else None,
+        size_shift=bool(attitude and not frames.isotropic and plain),
+        restitution_floor=None,
+    )
+    if plain:
+        geom_pos = geom_quat = None
+    else:
+        geom_pos, geom_quat = jnp.asarray(r.geom_pos[posed], dtype), jnp.asarray(r.geom_quat[posed], dtype)
+    mujoco = method.contact == "mujoco"
+    model = Model(
+        structure,
+        method,
+        dt=jnp.asarray(dt, dtype),
+        mass=jnp.asarray(r.mass, dtype),
+        inertia=jnp.asarray(frames.moments, dtype),
+        gravity=has(r.scene.gravity, r.scene.gravity) if r.scene.gravity is not None else None,
+        drag=None if scene.drag is None else jnp.asarray(np.broadcast_to(scene.drag, 2), dtype),
+        friction=jnp.asarray(r.geom_friction, dtype) if any_friction else None,
+        restitution=jnp.asarray(r.geom_restitution, dtype) if any_restitution else None,
+        pair_friction=own("friction") if overridden and any_friction else None,
+        pair_restitution=own("restitution") if overridden and any_restitution else None,
+        radius=has(kinds == "sphere", [s.radius for s in r.geom_shapes if s.kind == "sphere"]),
+        half_extents=has(box, [s.half_extents for s in r.geom_shapes if s.kind == "box"]),
+        geom_pos=geom_pos,
+        geom_quat=geom_quat,
+        static_pos=has(is_static, r.geom_pos[is_static]),
+        static_quat=has(is_static, r.geom_quat[is_static]),
+        com=None if _near(r.com, 0).all() else jnp.asarray(r.com, dtype),
+        principal=None if frames.principal is None else jnp.asarray(frames.principal, dtype),
+        laws=_mujoco_laws(r, groups, scene, dtype) if mujoco and groups else None,
+    )
+    return model, _start(model, r, dtype)
+
+
+def _near(a, b) -> np.ndarray:
+    """Rows of ``a`` that equal ``b`` to 1e-12 [m or -]."""
+    return np.abs(np.asarray(a, float) - np.asarray(b, float)).max(axis=-1, initial=0.0) <= 1e-12
+
+
+def _override_values(overrides, name: str) -> list[float]:
+    """The pairs' own coefficients; NaN = not given (the geoms' are used), absent counts as 0."""
+    values = [getattr(p, name) for p in overrides]
+    return [0.0 if v is None else (v if isinstance(v, (int, float)) else np.nan) for v in values]
+
+
+# --- bodies ---
+
+
+@dataclasses.dataclass
+class _Frames:
+    isotropic: bool
+    moments: np.ndarray
+    principal: np.ndarray | None
+    shift: np.ndarray
+
+
+def _principal_frames(r) -> _Frames:
+    """Moments, principal frames and which axis is farthest from the other two in 1/I."""
+    n = len(r.mass)
+    diagonal = np.diagonal(r.inertia, axis1=1, axis2=2).copy()
+    moments, frame = diagonal.copy(), np.tile([1.0, 0, 0, 0], (n, 1))
+    for i in range(n):
+        off = r.inertia[i] - np.diag(diagonal[i])
+        if np.abs(off).max() > 1e-12 * diagonal[i].max():
+            values, axes = np.linalg.eigh(r.inertia[i])
+            if np.linalg.det(axes) < 0:
+                axes[:, 2] *= -1
+            moments[i], frame[i] = values, _quat_of(axes)
+    equal = np.ptp(moments, axis=1) <= ISOTROPIC * moments.max(axis=1)
+    if equal.all():
+        return _Frames(True, moments.mean(axis=1), None, np.full(n, 2))
+    inverse = 1.0 / moments
+    gap = np.stack([np.minimum(abs(inverse[:, k] - inverse[:, k - 1]), abs(inverse[:, k] - inverse[:, k - 2])) for k in range(3)], 1)
+    shift = np.where(equal, 2, np.argmax(gap, axis=1))
+    principal = None if _near(frame, [1, 0, 0, 0]).all() else frame
+    return _Frames(False, moments, principal, shift)
+
+
+def _quat_of(R: np.ndarray) -> np.ndarray:
+    """Unit quaternion of a rotation matrix (largest component first, so it never divides by ~0)."""
+    t = np.trace(R)
+    q = np.empty(4)
+    k = int(np.argmax([t, R[0, 0], R[1, 1], R[2, 2]]))
+    if k == 0:
+        q[0] = 1 + t
+        q[1:] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    else:
+        i, j, m = k - 1, k % 3, (k + 1) % 3
+        q[0] = R[m, j] - R[j, m]
+        q[1 + i] = 1 + R[i, i] - R[j, j] - R[m, m]
+        q[1 + j] = R[i, j] + R[j, i]
+        q[1 + m] = R[i, m] + R[m, i]
+    return q / np.linalg.norm(q)
+
+
+def _needs_attitude(r, groups, kinds, category, centred) -> bool:
+    """Attitude is carried unless every body is made of centred spheres, without friction and without a mentioned spin."""
+    moving = category == "dynamic"
+    plain = (kinds[moving] == "sphere").all() and centred[moving].all()
+    if not moving.any():
+        plain = False
+    return not (plain and not any(g.friction for g in groups) and not r.omega_mentioned.any() and bool(groups))
+
+
+# --- pairs ---
+
+
+def _groups(r, kinds, category, centred, method: Method, n: int) -> tuple[Group, ...]:
+    if not len(r.pairs):
+        return ()
+    _, friction = r.pair_friction()
+    _, restitution = r.pair_restitution()
+    override = np.full(len(r.pairs), -1)
+    for k, row in enumerate(r.overrides):
+        override[row] = k
+    sphere_at_com = (kinds == "sphere") & centred & (category == "dynamic")
+    rank = np.array([RANK[k] for k in kinds])
+    first, second = r.pairs.T
+    # canonical order of kinds; of two equal kinds the one that does not move comes first
+    fixed = category != "dynamic"
+    swap = (rank[first] > rank[second]) | ((rank[first] == rank[second]) & ~fixed[first] & fixed[second])
+    a, b = np.where(swap, second, first), np.where(swap, first, second)
+    partner = np.where(fixed[a], category[a], np.where(fixed[b], category[b], "dynamic"))
+    flip = fixed[b]
+    key = list(zip(kinds[a], kinds[b], partner, flip, sphere_at_com[a], sphere_at_com[b], friction, restitution))
+    groups = []
+    for k in sorted(set(key), key=lambda k: (k[2] == "dynamic", *map(str, k))):
+        rows = np.array([i for i, other in enumerate(key) if other == k])
+        kind = (str(k[0]), str(k[1]))
+        if kind not in NARROW:
+            raise ValueError(f"no narrow phase for the pair {kind[0]}-{kind[1]} ({r.geom_names[a[rows[0]]]}, {r.geom_names[b[rows[0]]]})")
+        ga, gb = a[rows], b[rows]
+        body_a, body_b = r.geom_body[ga], r.geom_body[gb]
+        capacity = None
+        if len(rows) > DENSE_PAIRS.get(kind, 10**9):
+            capacity = min(len(rows), method.capacity or 8 * n)
+        if k[2] == "dynamic":
+            ends = np.stack([body_a, body_b], 1)
+        else:
+            ends = (body_a if k[3] else body_b)[:, None]
+        order, colours = _colour(ends) if capacity is None else (np.arange(len(rows)), ())
+        groups.append(Group(
+            kind, str(k[2]), bool(k[3]), ga[order], gb[order], body_a[order], body_b[order],
+            bool(k[4]), bool(k[5]), bool(k[6]), bool(k[7]), override[rows][order], colours, capacity,
+        ))
+    return tuple(groups)
+
+
+def _colour(ends: np.ndarray) -> tuple[np.ndarray, tuple[tuple[int, int], ...]]:
+    """Order pairs so that each slice (colour) holds every body at most once.
+
+    Greedy edge colouring, or the round-robin (i + j) mod n where that needs fewer colours.
+    """
+    used: dict[int, set[int]] = {}
+    colour = np.empty(len(ends), int)
+    for k, pair in enumerate(ends.tolist()):
+        taken = set().union(*(used.setdefault(i, set()) for i in pair))
+        c = next(c for c in range(len(taken) + 1) if c not in taken)
+        colour[k] = c
+        for i in pair:
+            used[i].add(c)
+    if ends.shape[1] == 2:
+        n = ends.max() + 1
+        size = n if n % 2 else n - 1
+        if size <= colour.max():
+            i, j = ends.min(1), ends.max(1)
+            # odd n: (i + j) mod n; even n: the last body meets i in round 2 i mod (n - 1)
+            robin = np.where((n % 2 == 0) & (j == n - 1), (2 * i) % size, (i + j) % size)
+            if len({(c, e) for c, p in zip(robin.tolist(), ends.tolist()) for e in p}) == 2 * len(ends):
+                colour = robin
+    order = np.lexsort((ends[:, 0], colour))
+    _, counts = np.unique(colour[order], return_counts=True)
+    stops = np.cumsum(counts)
+    return order, tuple((int(e - c), int(e)) for c, e in zip(counts, stops))
+
+
+def _mujoco_laws(r, groups, scene, dtype):
+    from .solvers.mujoco_law import group_laws
+
+    return group_laws(r, groups, scene, dtype)
+
+
+# --- the start state ---
+
+
+def _start(model: Model, r, dtype) -> State:
+    n = len(r.mass)
+    part = lambda a: tuple(jnp.asarray(np.ascontiguousarray(np.asarray(a, float)[:, k]), dtype) for k in range(a.shape[1]))
+    com = np.stack([p + rotation(q) @ c for p, q, c in zip(r.pos, r.quat, r.com)]) if n else np.zeros((0, 3))
+    kinematic = None
+    if len(r.kinematic_names):
+        kinematic = Kinematic(
+            Vec3(*part(r.kinematic_pos)), Quat(*part(r.kinematic_quat)),
+            Vec3(*part(r.kinematic_vel)), Vec3(*part(r.kinematic_omega)),
+        )
+    state = State(
+        Vec3(*part(com)), Vec3(*part(r.vel)), Quat(*part(r.quat)), Vec3(*part(r.omega)),
+        step=jnp.zeros((), jnp.int32), status=jnp.zeros((), jnp.uint32), dt=jnp.asarray(model.dt, dtype),
+        kinematic=kinematic,
+    )
+    from .step import with_memory
+
+    return with_memory(model, state)

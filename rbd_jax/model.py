@@ -1,0 +1,389 @@
+"""Layer 6: the model: static structure (selects the program) and traced numbers.
+
+Absence is None, zero is a value: a leaf that the scene does not mention is None and leaves no
+operation in the compiled program; one that it mentions as 0.0 is compiled in.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .bodies import Inertia
+from .contact import NARROW
+from .contact.base import Pose
+from .method import Method
+from .solvers.rows import Index
+from .spatial import Quat, Vec3, quat, vec3
+from .struct import static, struct
+
+
+@dataclasses.dataclass(frozen=True)
+class Group:
+    """All pairs of one kind and category (numpy, static).
+
+    a, b: geom rows of the pairs in canonical order of kinds. body_a, body_b: rows of the dynamic or
+    kinematic body. category: what the partner is. flip: the moving body is A, so the normal of the
+    narrow phase points away from it. central_*: the geom is a sphere whose centre is the centre of
+    mass. friction, restitution: whether any pair has them. capacity: None, or how many pairs are
+    kept at run time. override: rows of the model's pair leaves, -1 = none.
+    """
+
+    kind: tuple[str, str]
+    category: str
+    flip: bool
+    a: np.ndarray
+    b: np.ndarray
+    body_a: np.ndarray
+    body_b: np.ndarray
+    central_a: bool
+    central_b: bool
+    friction: bool
+    restitution: bool
+    override: np.ndarray
+    colours: tuple[tuple[int, int], ...] = ()
+    capacity: int | None = None
+
+    @property
+    def moving(self) -> tuple[np.ndarray | None, np.ndarray]:
+        """Body rows (A or None, B) of the contact rows: a single moving body is always B."""
+        if self.category == "dynamic":
+            return self.body_a, self.body_b
+        return None, (self.body_a if self.flip else self.body_b)
+
+    @property
+    def slots(self) -> int:
+        return NARROW[self.kind].slots
+
+
+class Structure:
+    """Everything about a model that selects its program; hashable by content, so equal scenes share one."""
+
+    def __init__(self, **fields):
+        self.__dict__.update(fields)
+        self._digest = hashlib.sha1(repr(sorted((k, _plain(v)) for k, v in fields.items() if k != "names")).encode()).digest()
+
+    def __hash__(self):
+        return hash(self._digest)
+
+    def __eq__(self, other):
+        return isinstance(other, Structure) and self._digest == other._digest
+
+
+def _plain(value):
+    if isinstance(value, np.ndarray):
+        return (value.shape, value.tobytes())
+    if dataclasses.is_dataclass(value):
+        return tuple(_plain(getattr(value, f.name)) for f in dataclasses.fields(value))
+    if isinstance(value, (tuple, list)):
+        return tuple(_plain(v) for v in value)
+    return value
+
+
+jax.tree_util.register_static(Structure)
+
+#: Axes of every leaf without batch axes.
+BASE_NDIM = dict(
+    dt=0, gravity=1, drag=1, mass=1, friction=1, restitution=1, radius=1, half_extents=2,
+    geom_pos=2, geom_quat=2, static_pos=2, static_quat=2, pair_friction=1, pair_restitution=1,
+    com=2, principal=2, solref=2, solimp=2, margin=1,
+)
+
+
+@struct
+class Model:
+    """A compiled scene. All leaves but ``structure`` and ``method`` are traced and may be changed with
+    :meth:`replace`, batched per world (batch axes first) and differentiated.
+
+    Attributes (n bodies, g geoms in the order of ``names.geoms``):
+      dt: [s]. gravity: (3,) [m/s^2]. drag: (2,) linear and angular rate [1/s].
+      mass: (n,) [kg]. inertia: (n,) when all bodies are isotropic, else (n, 3) principal moments in
+        the order of the body's axes [kg m^2].
+      friction, restitution: (g,) [-]. pair_friction, pair_restitution: (overridden pairs,).
+      radius: (spheres,) [m]. half_extents: (boxes, 3) [m], both in geom order.
+      geom_pos, geom_quat: (geoms of bodies, 3 | 4) in the body frame; static_pos, static_quat: of
+        static geoms in the world.
+      com: (n, 3) centre of mass in the body frame [m]. principal: (n, 4) principal frame in the
+        body frame. solref, solimp, margin: (g, 2), (g, 5), (g,) with the "mujoco" contact model.
+    """
+
+    structure: Structure = static()
+    method: Method = static()
+    dt: jax.Array = None
+    mass: jax.Array = None
+    inertia: jax.Array | None = None
+    gravity: jax.Array | None = None
+    drag: jax.Array | None = None
+    friction: jax.Array | None = None
+    restitution: jax.Array | None = None
+    pair_friction: jax.Array | None = None
+    pair_restitution: jax.Array | None = None
+    radius: jax.Array | None = None
+    half_extents: jax.Array | None = None
+    geom_pos: jax.Array | None = None
+    geom_quat: jax.Array | None = None
+    static_pos: jax.Array | None = None
+    static_quat: jax.Array | None = None
+    com: jax.Array | None = None
+    principal: jax.Array | None = None
+    solref: jax.Array | None = None
+    solimp: jax.Array | None = None
+    margin: jax.Array | None = None
+    laws: object = None
+
+    @property
+    def names(self):
+        return self.structure.names
+
+    @property
+    def n(self) -> int:
+        return self.structure.n
+
+    def base_ndim(self, field: str) -> int:
+        if field == "inertia":
+            return 1 if self.structure.isotropic else 2
+        return BASE_NDIM[field]
+
+    def replace(self, **leaves) -> Model:
+        """Return a copy with other numbers; never recompiles unless shapes gain batch axes.
+
+        Leaves are independent: a new size does not change the mass.
+
+        Raises:
+          ValueError: an unknown field, a field that this scene does not mention (absent, None), or
+            a shape that is neither the leaf's nor the leaf's with batch axes in front.
+        """
+        for name, value in leaves.items():
+            if name not in BASE_NDIM and name != "inertia":
+                raise ValueError(f"Model has no leaf '{name}'; leaves: {', '.join(sorted([*BASE_NDIM, 'inertia']))}")
+            old = getattr(self, name)
+            if old is None:
+                raise ValueError(
+                    f"Model.{name} is absent: the scene does not mention it, so nothing was compiled for it; "
+                    "mention it in the scene (0.0 is a value)"
+                )
+            value = jnp.asarray(value, old.dtype)
+            base = old.shape[old.ndim - self.base_ndim(name) :]
+            if value.shape[value.ndim - len(base) :] != base or value.ndim < len(base):
+                raise ValueError(
+                    f"Model.{name} has shape {value.shape}; it needs {base}, with batch axes in front if any"
+                )
+            if not isinstance(value, jax.core.Tracer):
+                _check_number(name, np.asarray(value))
+            leaves[name] = value
+        return self._with(**leaves)
+
+    def __repr__(self):
+        s = self.structure
+        shown = ", ".join(f for f in ("inertia", *BASE_NDIM) if getattr(self, f) is not None)
+        return f"Model({s.n} bodies, {len(s.kinds)} geoms, {sum(len(g.a) for g in s.groups)} pairs; {shown})"
+
+
+def _check_number(name: str, value: np.ndarray) -> None:
+    rules = {
+        "dt": (value > 0, "> 0 [s]"), "mass": (value > 0, "> 0 [kg]"), "inertia": (value > 0, "> 0 [kg m^2]"),
+        "radius": (value > 0, "> 0 [m]"), "half_extents": (value > 0, "> 0 [m]"),
+        "friction": (value >= 0, ">= 0"), "restitution": ((value >= 0) & (value <= 1), "in 0..1"),
+        "pair_friction": (value >= 0, ">= 0"), "pair_restitution": ((value >= 0) & (value <= 1), "in 0..1"),
+    }
+    ok, rule = rules.get(name, (np.ones_like(value, bool), "finite"))
+    bad = ~(ok & np.isfinite(value))
+    if bad.any():
+        where = tuple(int(i) for i in np.argwhere(bad)[0])
+        raise ValueError(f"Model.{name}{list(where)} = {value[where] if where else value} must be finite and {rule}")
+
+
+# --- the hot form of the numbers ---
+
+
+@struct
+class GroupParams:
+    """Numbers of one group, (P, 1) or (P, B). Poses are in the frame of their body or the world."""
+
+    size_a: tuple
+    size_b: tuple
+    local_a: Pose | None
+    local_b: Pose | None
+    mu: jax.Array | None
+    e: jax.Array | None
+    law: object
+
+
+@struct
+class Params:
+    """The numbers of a model in the hot layout: (n, 1), or (n, B) where a leaf has batch axes."""
+
+    h: jax.Array
+    mass: jax.Array
+    inv_mass: jax.Array
+    groups: tuple
+    one: jax.Array
+    inertia: Inertia | None = None
+    gravity: Vec3 | None = None
+    drag: tuple | None = None
+    com: Vec3 | None = None
+    principal: Quat | None = None
+
+
+def leaf(model: Model, name: str, batch: tuple[int, ...]) -> jax.Array | None:
+    """A leaf as (k..., 1), or (k..., B) when it has batch axes."""
+    value = getattr(model, name)
+    if value is None:
+        return None
+    base = model.base_ndim(name)
+    own = value.shape[: value.ndim - base]
+    if not own:
+        return value[..., None]
+    tail = value.shape[value.ndim - base :]
+    value = value.reshape(*own, *(1,) * (len(batch) - len(own)), *tail)
+    value = jnp.broadcast_to(value, (*batch, *tail))
+    return jnp.moveaxis(value.reshape(math.prod(batch), *tail), 0, -1)
+
+
+def _vec3(x: jax.Array) -> Vec3:
+    """Vec3 from (k, 3, B)."""
+    return Vec3(x[:, 0], x[:, 1], x[:, 2])
+
+
+def _quat(x: jax.Array) -> Quat:
+    return Quat(x[:, 0], x[:, 1], x[:, 2], x[:, 3]).normalised()
+
+
+def batch_of(model: Model, batch: tuple[int, ...]) -> tuple[int, ...]:
+    """Batch axes of a state of ``batch`` under this model: a batched model makes a batch of worlds.
+
+    The batch axes of a leaf are aligned with the first batch axes of the state.
+
+    Raises:
+      ValueError: batch sizes that do not match, naming the leaf.
+    """
+    for name in ("inertia", *BASE_NDIM):
+        value = getattr(model, name)
+        if value is not None:
+            own = tuple(value.shape[: value.ndim - model.base_ndim(name)])
+            k = max(len(own), len(batch))
+            try:
+                batch = np.broadcast_shapes(batch + (1,) * (k - len(batch)), own + (1,) * (k - len(own)))
+            except ValueError:
+                raise ValueError(
+                    f"batch sizes do not match: Model.{name} has batch axes {own}, the state has {batch}"
+                ) from None
+    return tuple(batch)
+
+
+def params(model: Model, batch: tuple[int, ...], one: jax.Array) -> Params:
+    """The hot numbers of a model for worlds with batch axes ``batch``."""
+    s = model.structure
+    get = lambda name: leaf(model, name, batch)
+    h = get("dt")[0] if model.dt.ndim == 0 else get("dt")
+    h = h / model.method.substeps
+    mass = get("mass")
+    inertia = None
+    if s.attitude:
+        moments = get("inertia")
+        if not s.isotropic:
+            m = (moments[:, 0], moments[:, 1], moments[:, 2])
+            shift = s.axis_shift[:, None]  # the body axis that is the principal z
+            pick = lambda k: jnp.where(shift == 2, m[k], jnp.where(shift == 0, m[(k + 1) % 3], m[(k + 2) % 3]))
+            moments = Vec3(pick(0), pick(1), pick(2))
+        inertia = Inertia(moments)
+    gravity = get("gravity")
+    drag = get("drag")
+    return Params(
+        h=h,
+        mass=mass,
+        inv_mass=1.0 / mass,
+        groups=tuple(_group_params(model, g, i, get, batch) for i, g in enumerate(s.groups)),
+        one=one,
+        inertia=inertia,
+        gravity=None if gravity is None else Vec3(gravity[0], gravity[1], gravity[2]),
+        drag=None if drag is None else (drag[0], drag[1]),
+        com=None if model.com is None else _vec3(get("com")),
+        principal=_principal(model, get),
+    )
+
+
+#: Cyclic permutations of the axes: attitude of a frame whose z is the body's x, y or z.
+SHIFTS = np.array([[0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5], [1.0, 0.0, 0.0, 0.0]])
+
+
+def _principal(model: Model, get) -> Quat | None:
+    """Attitude of the (permuted) principal frame in the body frame."""
+    s = model.structure
+    if not s.attitude:
+        return None
+    base = None if model.principal is None else _quat(get("principal"))
+    if s.axis_shift is None or (s.axis_shift == 2).all():
+        return base
+    turn = SHIFTS[s.axis_shift].astype(model.mass.dtype)
+    turn = Quat(*(jnp.asarray(turn[:, k : k + 1]) for k in range(4)))
+    return turn if base is None else base @ turn
+
+
+def _group_params(model: Model, g: Group, number: int, get, batch) -> GroupParams:
+    s = model.structure
+
+    def side(kind: str, geoms: np.ndarray, bodies: np.ndarray, moving: bool, category: str):
+        rows = s.row[geoms]
+        size = ()
+        if kind == "sphere":
+            size = (get("radius")[rows],)
+        elif kind == "box":
+            h = get("half_extents")[rows]
+            h = (h[:, 0], h[:, 1], h[:, 2])
+            if moving and s.size_shift:
+                shift = s.axis_shift[bodies][:, None]
+                h = tuple(
+                    jnp.where(shift == 2, h[k], jnp.where(shift == 0, h[(k + 1) % 3], h[(k + 2) % 3]))
+                    for k in range(3)
+                )
+            size = h
+        if category == "static":
+            rows = s.static_row[geoms]
+            return size, Pose(_vec3(get("static_pos")[rows]), _quat(get("static_quat")[rows]))
+        if model.geom_pos is None:
+            return size, None
+        x = _vec3(get("geom_pos")[geoms])
+        q = _quat(get("geom_quat")[geoms])
+        if moving:
+            if model.com is not None:
+                x = x - _vec3(get("com")[bodies])
+            frame = _principal(model, get)
+            if frame is not None:
+                frame = jax.tree.map(lambda c: c[bodies], frame)
+                x, q = frame.rotate_inv(x), frame.conj() @ q
+        return size, Pose(x, q)
+
+    cat_a = "dynamic" if g.category == "dynamic" or g.flip else g.category
+    cat_b = "dynamic" if g.category == "dynamic" or not g.flip else g.category
+    size_a, local_a = side(g.kind[0], g.a, g.body_a, cat_a == "dynamic", cat_a)
+    size_b, local_b = side(g.kind[1], g.b, g.body_b, cat_b == "dynamic", cat_b)
+
+    def combined(name: str, used: bool):
+        """Larger of the two geoms, then the pair's own value."""
+        if not used:
+            return None
+        values = get(name)
+        if values is None:
+            value = jnp.zeros((len(g.a), 1), model.mass.dtype)
+        else:
+            value = jnp.maximum(values[g.a], values[g.b])
+        own = get("pair_" + name)
+        if own is None:
+            return value
+        rows = g.override
+        picked = own[np.maximum(rows, 0)]
+        return jnp.where((rows >= 0)[:, None] & ~jnp.isnan(picked), picked, value)
+
+    law = None
+    if model.laws is not None:
+        law = jax.tree.map(lambda c: c[..., None], model.laws[number])
+    return GroupParams(
+        size_a, size_b, local_a, local_b,
+        combined("friction", g.friction), combined("restitution", g.restitution), law,
+    )

@@ -1,0 +1,349 @@
+"""Layer 7: one step of all worlds, in the hot layout.
+
+    kick:   v* = v + h a,  L* = L + h tau          (all forces but contact)
+    solve:  contact impulses at the poses of the start of the step
+    move:   poses with the solved velocities
+
+A body that touches nothing moves ballistically (x + h v + h^2 a / 2); one that touches moves with
+its end velocity along the contact normal and with the mean velocity along the surface.
+Source: solver order of Moreau-Jean time stepping; the switch is ours.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from .bodies import Bodies
+from .detect import detect
+from .model import Model, Params, Structure, batch_of, params
+from .solvers.base import Problem, Solution
+from .solvers.restitution import normal_velocity, targets
+from .solvers.rows import Impulses, InverseInertia, add_rows, take
+from .spatial import Quat, Vec3, qexp, unit_or, where, zeros_like
+from .state import Kinematic, Memory, State, World, Wrench, to_hot, to_public
+from .status import Status
+from .struct import struct
+from .xla import materialise, opaque_one
+
+FROZEN = int(Status.NOT_FINITE)
+
+
+# --- public state <-> hot world ---
+
+
+def with_memory(model: Model, state: State) -> State:
+    """``state`` with the memory that this model's method keeps, cold where it has none."""
+    if state.memory is not None:
+        return state
+    s, batch = model.structure, state.batch_shape
+    dtype = state.x.x.dtype
+    zero = lambda *shape: jnp.zeros((*batch, *shape), dtype)
+    contacts, feature, pairs = [], [], []
+    for g in s.groups:
+        shape = (g.slots, g.capacity or len(g.a))
+        lam = zero(*shape)
+        contacts.append(Impulses(lam, lam, lam) if g.friction else Impulses(lam))
+        varies = g.kind == ("box", "box")
+        feature.append(jnp.full((*batch, shape[1]), -1, jnp.int32) if varies else None)
+        pairs.append(jnp.full((*batch, shape[1]), len(g.a), jnp.int32) if g.capacity else None)
+    L = R = None
+    if s.attitude:
+        nan = jnp.full_like(state.x.x, jnp.nan)
+        L = Vec3(nan, nan, nan)
+        if model.method.integrator.carries_matrix:
+            R = _principal_attitude(model, state).mat()
+    return state._with(memory=Memory(L, R, tuple(contacts), tuple(feature), tuple(pairs)))
+
+
+def _principal_attitude(model: Model, state: State) -> Quat:
+    """Attitude of the principal frames, in the public layout."""
+    batch = state.batch_shape
+    p = params(model, batch, jnp.ones(()))
+    q = to_hot(state.q, batch).normalised()
+    if p.principal is not None:
+        q = q @ p.principal
+    return to_public(jax.tree.map(lambda c: jnp.broadcast_to(c, (state.n, max(1, c.shape[-1]))), q), batch)
+
+
+@jax.custom_jvp
+def _exactly(computed, remembered):
+    """``remembered`` where it agrees with ``computed`` to rounding; derivatives are those of ``computed``."""
+    near = jnp.zeros((), bool)
+    eps = 16 * jnp.finfo(computed.x.dtype).eps
+    d = computed - remembered
+    near = d.dot(d) <= eps * eps * computed.dot(computed)
+    return where(near, remembered, computed)
+
+
+@_exactly.defjvp
+def _exactly_jvp(primals, tangents):
+    return _exactly(*primals), tangents[0]
+
+
+def enter(model: Model, state: State, batch: tuple[int, ...]) -> tuple[Params, World]:
+    """Hot numbers and hot world of a public state whose leaves have batch axes ``batch``."""
+    s = model.structure
+    own = state.batch_shape
+    grow = lambda c: c.reshape(*own, *(1,) * (len(batch) - len(own)), *c.shape[len(own) :])
+    state = jax.tree.map(lambda c: jnp.broadcast_to(grow(c), (*batch, *c.shape[len(own) :])), state)
+    one = opaque_one(model.dt)
+    p = params(model, batch, one)
+    hot = to_hot(state, batch)
+    memory = hot.memory
+    if s.attitude:
+        q = hot.q.normalised()
+        if p.principal is not None:
+            q = q @ p.principal
+        L = p.inertia.momentum(q, hot.w)
+        L = _exactly(L, memory.L)
+        bodies = Bodies(hot.x, hot.v, q, L, memory.R)
+        quat = spin = None
+    else:
+        bodies = Bodies(hot.x, hot.v)
+        quat, spin = hot.q, hot.w
+    return p, World(
+        bodies, quat, spin, hot.kinematic, memory.contacts, memory.feature, memory.pairs, hot.step, hot.status
+    )
+
+
+def leave(model: Model, p: Params, world: World, batch: tuple[int, ...] | None, memory: bool = True) -> State:
+    """The public state of a hot world; with ``batch`` None the same in the hot layout."""
+    bodies = world.bodies
+    if bodies.q is None:
+        quat, spin = world.quat, world.spin
+    else:
+        quat = bodies.q if p.principal is None else bodies.q @ p.principal.conj()
+        spin = p.inertia.velocity(bodies.q, bodies.L)
+    dt = jnp.broadcast_to(p.h * model.method.substeps, world.step.shape)
+    kept = Memory(bodies.L, bodies.R, world.contacts, world.feature, world.pairs) if memory else None
+    hot = State(bodies.x, bodies.v, quat, spin, world.step, world.status, dt, world.kinematic, kept)
+    return hot if batch is None else to_public(hot, batch)
+
+
+# --- forces ---
+
+
+def acceleration(p: Params, wrench: Wrench | None, bodies: Bodies):
+    """Acceleration [m/s^2] and torque [N m] of gravity, wrench (hot Vec3s) and drag; None = absent."""
+    a = tau = None
+    if p.gravity is not None:
+        a = Vec3(*(jnp.broadcast_to(c, bodies.x.x.shape) for c in (p.gravity.x, p.gravity.y, p.gravity.z)))
+    if wrench is not None:
+        if wrench.force is not None:
+            push = wrench.force * p.inv_mass
+            a = push if a is None else a + push
+        if bodies.L is not None:
+            tau = wrench.torque
+    if p.drag is not None:
+        linear, angular = p.drag
+        slow = bodies.v * -linear
+        a = slow if a is None else a + slow
+        if bodies.L is not None:
+            damp = bodies.L * -angular
+            tau = damp if tau is None else tau + damp
+    return a, tau
+
+
+def free_force(p: Params, wrench: Wrench | None):
+    """The force function of ``Integrator.advance``."""
+
+    def force(bodies: Bodies):
+        return acceleration(p, wrench, bodies)
+
+    force.constant = p.drag is None
+    force.damped = p.drag is not None
+    return force
+
+
+# --- the step ---
+
+
+def advance(model: Model, p: Params, world: World, wrench: Wrench | None) -> World:
+    """One step of dt: ``substeps`` equal parts, then the step counter and the finite check."""
+    new = world
+    for _ in range(model.method.substeps):
+        new = _substep(model, p, new, wrench)
+    return _freeze(world, new, p)
+
+
+def _freeze(old: World, new: World, p: Params) -> World:
+    """A world that is no longer finite stays at its last finite state and says so."""
+    total = sum(c * 0 for c in jax.tree.leaves(new.bodies))
+    total = materialise(total.sum(axis=0), p.one)
+    frozen = (new.status & jnp.uint32(FROZEN)) != 0
+    ok = (total == 0) & ~frozen
+    status = jnp.where(total == 0, new.status, new.status | jnp.uint32(FROZEN))
+    new = new._with(step=new.step + 1)
+    kept = jax.tree.map(lambda a, b: jnp.where(ok, a, b), new, old)
+    return kept._with(status=status)
+
+
+def _substep(model: Model, p: Params, world: World, wrench: Wrench | None) -> World:
+    s, integrator = model.structure, model.method.integrator
+    if not s.groups:
+        bodies = integrator.advance(world.bodies, free_force(p, wrench), p.inertia, p.h, one=p.one)
+        return world._with(bodies=bodies, kinematic=_prescribed(p, world.kinematic))
+    if model.method.solver.level == "force":
+        return _force_step(model, p, world, wrench)
+    old = world.bodies
+    contacts = detect(s, p, world, everything=model.method.contact == "soft")
+    a, tau = acceleration(p, wrench, old)
+    v, L = integrator.kick(old, a, tau, p.inertia, p.h)
+    problem = _problem(p, old, v, L, contacts)
+    solution = model.method.solver.solve(problem)
+    v1 = v + solution.impulse * p.inv_mass
+    L1 = L if solution.angular_impulse is None else L + solution.angular_impulse
+    v1, L1 = materialise((v1, L1), p.one)
+    v_move = v1 if solution.v_move is None else solution.v_move
+    L_move = L1
+    if solution.w_move is not None:
+        L_move = p.inertia.momentum(old.q, solution.w_move)
+    bodies = integrator.move(old, v_move, L_move, p.inertia, p.h, one=p.one)
+    x = bodies.x
+    if integrator.order >= 2:
+        x = x + _correction(p, problem, solution, old.v, v1, v_move)
+    bodies = bodies._with(x=x, v=v1, L=L1)
+    return _remember(world, bodies, p, contacts, solution)
+
+
+def _problem(p: Params, old: Bodies, v: Vec3, L: Vec3 | None, contacts) -> Problem:
+    w0 = w = inverse = None
+    if L is not None:
+        inverse = materialise(_inverse_inertia(p, old), p.one)
+        w0, w = inverse @ old.L, inverse @ L
+    return Problem(
+        rows=tuple(c.rows for c in contacts),
+        v0=old.v,
+        v=v,
+        w0=w0,
+        w=w,
+        inv_mass=p.inv_mass,
+        h=p.h,
+        warm=tuple(c.warm for c in contacts),
+        one=p.one,
+        q=old.q,
+        inertia=p.inertia,
+        inv_inertia=inverse,
+    )
+
+
+def _inverse_inertia(p: Params, bodies: Bodies) -> InverseInertia:
+    """R I^-1 R^T of every body."""
+    if p.inertia.isotropic:
+        return InverseInertia(1.0 / p.inertia.moments)
+    r = bodies.q.mat()
+    d = Vec3(*(1.0 / c for c in (p.inertia.moments.x, p.inertia.moments.y, p.inertia.moments.z)))
+    ax, bx, cx = r.a * d, r.b * d, r.c * d
+    return InverseInertia(ax.dot(r.a), bx.dot(r.b), cx.dot(r.c), ax.dot(r.b), ax.dot(r.c), bx.dot(r.c))
+
+
+def _remember(world: World, bodies: Bodies, p: Params, contacts, solution: Solution) -> World:
+    status = world.status
+    for c in contacts:
+        if c.overflow is not None:
+            status = status | jnp.where(c.overflow, jnp.uint32(int(Status.CAPACITY)), jnp.uint32(0))
+    if solution.unconverged is not None:
+        status = status | jnp.where(solution.unconverged, jnp.uint32(int(Status.NOT_CONVERGED)), jnp.uint32(0))
+    shape = lambda new, old: jax.tree.map(lambda a, b: jnp.broadcast_to(a, b.shape).astype(b.dtype), new, old)
+    return world._with(
+        bodies=bodies,
+        kinematic=_prescribed(p, world.kinematic),
+        contacts=tuple(shape(c, w) for c, w in zip(solution.contacts, world.contacts)),
+        feature=tuple(
+            None if w is None else shape(c.rows.feature, w) for c, w in zip(contacts, world.feature)
+        ),
+        pairs=tuple(c.pairs for c in contacts),
+        status=status,
+    )
+
+
+def _prescribed(p: Params, k: Kinematic | None) -> Kinematic | None:
+    """Kinematic bodies after h at their constant velocities."""
+    if k is None:
+        return None
+    return k._with(x=k.x + k.v * p.h, q=(qexp(k.w * p.h) @ k.q).normalised())
+
+
+def _force_step(model: Model, p: Params, world: World, wrench: Wrench | None) -> World:
+    """Contact as a force of the state, integrated like any other (MuJoCo's scheme)."""
+    s, integrator, solver = model.structure, model.method.integrator, model.method.solver
+    record = []
+
+    def force(bodies: Bodies):
+        contacts = detect(s, p, world._with(bodies=bodies), everything=True)
+        a, tau = acceleration(p, wrench, bodies)
+        v, L = bodies.v if a is None else bodies.v + a * p.h, bodies.L
+        problem = _problem(p, bodies, v, L, contacts)
+        if L is not None:
+            # w at constant inertia: gyroscopic and applied torque at the start of the step
+            w0 = problem.w0
+            push = bodies.L.cross(w0)
+            push = push if tau is None else push + tau
+            problem = problem._with(w=w0 + (problem.inv_inertia @ push) * p.h)
+        solution = solver.solve(problem)
+        record.append((contacts, solution))
+        push = solution.impulse * (p.inv_mass / p.h)
+        turn = solution.angular_impulse
+        a = push if a is None else a + push
+        if turn is not None:
+            tau = turn / p.h if tau is None else tau + turn / p.h
+        return a, tau
+
+    force.constant = False
+    bodies = integrator.advance(world.bodies, force, p.inertia, p.h, one=p.one)
+    contacts, solution = record[0]
+    return _remember(world, bodies, p, contacts, solution)
+
+
+def _correction(p: Params, problem: Problem, solution: Solution, v0: Vec3, v1: Vec3, v_move: Vec3) -> Vec3:
+    """What is added to x + h v_move: the ballistic or tangential half step, and impacts within the step.
+
+    d = h (v0 - v1) / 2 turns the end velocity into the mean velocity. A body in contact takes only
+    its part along the surface (perpendicular to its total normal impulse), which is what makes a
+    sliding distance second order without lifting or sinking.
+    """
+    push = zeros_like(v0)
+    shift = None
+    for rows, lam in zip(problem.rows, solution.contacts):
+        total = lam.n.sum(axis=0)
+        push = _spread(push, rows.b, rows.n * total, 1.0)
+        if rows.a is not None:
+            push = _spread(push, rows.a, rows.n * total, -1.0)
+        if rows.e is not None:
+            shift = zeros_like(v0) if shift is None else shift
+            shift = _impact_shift(p, problem, rows, lam, v1, v_move, shift)
+    push = materialise(push, p.one)
+    s = push.dot(push)
+    touched = s > 0
+    d = (v0 - v1) * (0.5 * p.h)
+    along = jnp.where(touched, push.dot(d) / jnp.where(touched, s, 1.0), 0.0)
+    d = d - push * along
+    return d if shift is None else d + shift
+
+
+def _spread(total: Vec3, index, values: Vec3, sign: float) -> Vec3:
+    return Vec3(*(add_rows(t, index, sign * v) for t, v in zip((total.x, total.y, total.z), (values.x, values.y, values.z))))
+
+
+def _impact_shift(p: Params, problem: Problem, rows, lam: Impulses, v1: Vec3, v_move: Vec3, shift: Vec3) -> Vec3:
+    """Moves bodies so that the gap at the end of the step is that of a bounce at its own instant.
+
+    The gap wanted is u+ left - a left^2 / 2, with u+ the normal velocity reached; the change is
+    shared between the two bodies by inverse mass, so their centre of mass does not move.
+    """
+    events = targets(rows, problem)
+    u = normal_velocity(rows, v1, None)
+    um = normal_velocity(rows, v_move, None)
+    want = events.left * (u - 0.5 * events.accel * events.left)
+    gap = jnp.where(events.active, want - rows.phi - p.h * um, 0.0)
+    weight = jnp.where(events.active, lam.n, 0.0)
+    total = weight.sum(axis=0)
+    some = total > 0
+    gap = jnp.where(some, (gap * weight).sum(axis=0) / jnp.where(some, total, 1.0), 0.0)
+    mb = take(p.inv_mass, rows.b)
+    if rows.a is None:
+        return _spread(shift, rows.b, rows.n * gap, 1.0)
+    ma = take(p.inv_mass, rows.a)
+    shift = _spread(shift, rows.b, rows.n * (gap * (mb / (ma + mb))), 1.0)
+    return _spread(shift, rows.a, rows.n * (gap * (ma / (ma + mb))), -1.0)
