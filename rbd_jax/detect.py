@@ -83,7 +83,7 @@ def _group(s, g: Group, gp: GroupParams, p: Params, world: World, number: int, r
         k = world.kinematic
         r = m.point - take_tree(k.x, index)
         surface = take_tree(k.v, index) + take_tree(k.w, index).cross(r)
-    feature = None if m.feature.shape == (1, 1) else m.feature
+    feature = m.feature if g.features else None
     rows = Rows(
         n=n,
         rb=arm(index_b),

@@ -8,7 +8,7 @@ What MJCF has no field for is written under ``<custom>``, in elements named
     rbd_friction:GEOM      a friction coefficient [-] that is a value although 0 or on a geom of condim 1
     rbd_vel:BODY           velocity [m/s]: of a mocap body's origin; of a free body's centre of mass
     rbd_omega:BODY         angular velocity, world [rad/s]
-    rbd_drag               drag coefficient
+    rbd_drag               drag rate, or (linear, angular) [1/s]
     rbd_gravity            gravity [m/s^2] that is a value although 0
     rbd_mass:BODY, rbd_density:BODY, rbd_com:BODY, rbd_inertia:BODY   digits of mass properties as they were given
     rbd_given:BODY         (text) which of mass, density, com, inertia the scene gave
@@ -235,7 +235,7 @@ class _Reader:
         rules = {  # kind -> (allowed counts, whose name follows)
             "rbd_restitution": ((1,), geoms), "rbd_friction": ((1,), geoms), "rbd_vel": ((3,), bodies),
             "rbd_omega": ((3,), bodies), "rbd_mass": ((1,), bodies), "rbd_density": ((1,), bodies),
-            "rbd_com": ((3,), bodies), "rbd_inertia": ((3, 9), bodies), "rbd_drag": ((1,), None),
+            "rbd_com": ((3,), bodies), "rbd_inertia": ((3, 9), bodies), "rbd_drag": ((1, 2), None),
             "rbd_gravity": ((3,), None),
         }  # fmt: skip
         errors = []
@@ -449,13 +449,14 @@ class _Reader:
             gravity = None
         elif not any(gravity) and "gravity" not in self.keep and "rbd_gravity" not in self.numeric:
             gravity = None
+        drag = self.numeric.get("rbd_drag", (None,))
         scene = Scene(
             bodies=[self._body(b, [geoms[g] for g in self.geoms[b]]) for b in self.free],
             kinematic=[self._mocap(b, [geoms[g] for g in self.geoms[b]]) for b in self.mocap],
             static=[geoms[g] for b in self.fixed for g in self.geoms[b]],
             gravity=gravity,
             dt=float(m.opt.timestep),
-            drag=self.numeric.get("rbd_drag", (None,))[0],
+            drag=drag[0] if len(drag) == 1 else drag,
             name=m.names.split(b"\0")[0].decode(),
             integrator=_COMPILED_INTEGRATORS[int(m.opt.integrator)].lower(),
             impratio=float(m.opt.impratio),
@@ -509,7 +510,7 @@ class _Reader:
             group=int(m.geom_contype[g]),
             mask=int(m.geom_conaffinity[g]),
             name=None if name in unnamed else name,
-            margin=float(m.geom_margin[g]) if self.collides[g] else 0.0,
+            margin=max(float(m.geom_margin[g]), 0.0),  # negative only where nothing collides
             solref=tuple(m.geom_solref[g]),
             solimp=tuple(m.geom_solimp[g]),
             condim=1 if condim == 1 and friction is not None else 3,
@@ -520,7 +521,8 @@ class _Reader:
         q, v = m.jnt_qposadr[m.body_jntadr[b]], m.jnt_dofadr[m.body_jntadr[b]]
         qpos = m.qpos0 if self.key is None else m.key_qpos[self.key]
         qvel = np.zeros(m.nv) if self.key is None else m.key_qvel[self.key]
-        body = Body(name, geoms, pos=tuple(qpos[q : q + 3]), quat=tuple(qpos[q + 3 : q + 7]), **self._inertial(b, geoms))
+        pos, quat = tuple(qpos[q : q + 3]), tuple(qpos[q + 3 : q + 7])
+        body = Body(name, geoms, pos=pos, quat=quat, **self._inertial(b, geoms))
         turn, com = rotation(body.quat), mass_properties(body)[1]
         omega = turn @ qvel[v + 3 : v + 6]
         vel = qvel[v : v + 3] + np.cross(omega, turn @ com)
@@ -692,13 +694,14 @@ def to_mjcf(scene: Scene) -> str:
         _write_body_custom(custom, body, kinematic=True)
     _write_geom_custom(custom, r)
     if scene.drag is not None:
-        custom.numeric["rbd_drag"] = (scene.drag,)
+        custom.numeric["rbd_drag"] = scene.drag
     if scene.gravity is not None and not any(scene.gravity):
         custom.numeric["rbd_gravity"] = scene.gravity
     _write_contact(root, r, custom)
     custom.write(root)
     if any(qvel):
-        key = ET.SubElement(ET.SubElement(root, "keyframe"), "key", name=START_KEY, qpos=_digits(qpos), qvel=_digits(qvel))
+        frame = ET.SubElement(root, "keyframe")
+        key = ET.SubElement(frame, "key", name=START_KEY, qpos=_digits(qpos), qvel=_digits(qvel))
         if mpos:
             key.set("mpos", _digits(mpos))
             key.set("mquat", _digits(mquat))
@@ -707,7 +710,11 @@ def to_mjcf(scene: Scene) -> str:
 
 
 def compile_mujoco(scene: Scene) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """Return MuJoCo's model of a scene and its data at the start state, after one ``mj_forward``."""
+    """Return MuJoCo's model of a scene and its data at the start state, after one ``mj_forward``.
+
+    MuJoCo 4.0.1 raises ``FatalError`` ("broadphase buffer full") where two or more of world and mocap bodies
+    hold planes and two or more bodies move; rbd_jax simulates such scenes.
+    """
     model = mujoco.MjModel.from_xml_string(to_mjcf(scene))
     data = mujoco.MjData(model)
     if model.nkey:
@@ -775,11 +782,12 @@ def _write_inertial(element, mass, com, inertia):
         axes[:, 0] *= np.sign(np.linalg.det(axes))
         mujoco.mju_mat2Quat(quat, axes.ravel())
         quat /= np.linalg.norm(quat)
-    # MuJoCo refuses a triangle inequality broken by rounding (absolute 1e-14); a flat body lies on the bound.
+    # A flat body lies on the bound of the triangle inequality, and MuJoCo refuses one that rounding has broken.
     top = int(np.argmax(moments))
-    lack = moments[top] - (moments.sum() - moments[top])
-    if lack > 0:
-        moments[(top + 1) % 3] += lack
+    one, two = (top + 1) % 3, (top + 2) % 3
+    lack = moments[top] - (moments[one] + moments[two])
+    if lack > -4 * np.finfo(float).eps * moments[top]:
+        moments[one] += max(lack, 0.0) + 4 * np.finfo(float).eps * moments[top]
     ET.SubElement(
         element, "inertial", pos=_digits(com), mass=_digits(mass), diaginertia=_digits(moments), quat=_digits(quat)
     )

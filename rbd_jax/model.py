@@ -60,6 +60,11 @@ class Group:
     def slots(self) -> int:
         return NARROW[self.kind].slots
 
+    @property
+    def features(self) -> bool:
+        """Whether a slot may hold another feature in the next step (else the slot is the feature)."""
+        return self.kind == ("box", "box")
+
 
 class Structure:
     """Everything about a model that selects its program; hashable by content, so equal scenes share one."""

@@ -199,7 +199,8 @@ class Pair:
         put("condim", None if self.condim is None else _condim(self.condim, who))
         if not isinstance(self.exclude, (bool, np.bool_)):
             raise TypeError(f"{who}: exclude = {self.exclude!r} must be True or False")
-        if self.exclude and self != Pair(self.a, self.b, exclude=True):
+        given = (self.friction, self.restitution, self.solref, self.solimp, self.margin, self.condim)
+        if self.exclude and given != (UNSET, UNSET, None, None, None, None):
             raise ValueError(f"{who}: exclude = True leaves no contact to set friction, restitution, ... of")
 
 
@@ -214,7 +215,8 @@ class Scene:
       pairs: overrides and exclusions.
       gravity: acceleration [m/s^2]; ``None`` is absent.
       dt: time step [s].
-      drag: drag coefficient, >= 0; ``None`` is absent. MJCF has no such field.
+      drag: rate of drag [1/s], >= 0, one for both or (linear, angular); ``None`` is absent.
+        MJCF has no such field.
       name: of the scene; the model name in MJCF.
       integrator: MuJoCo's integrator, ``"euler"``, ``"implicitfast"`` or ``"rk4"``; used by the ``"mujoco"`` method.
       cone: friction cone; only ``"elliptic"``.
@@ -231,7 +233,7 @@ class Scene:
     pairs: Any = ()
     gravity: Any = (0.0, 0.0, -9.81)
     dt: float = 0.002
-    drag: float | None = None
+    drag: Any = None
     name: str = "scene"
     integrator: str = "euler"
     cone: str = "elliptic"
@@ -252,7 +254,7 @@ class Scene:
         put("static", tuple(check_geom(g, f"static {_geom_label(g, i)}") for i, g in enumerate(many)))
         put("gravity", None if self.gravity is None else _vector(self.gravity, 3, "scene", "gravity", "[m/s^2]"))
         put("dt", _positive(self.dt, "scene", "dt", "[s]"))
-        put("drag", None if self.drag is None else _nonnegative(self.drag, "scene", "drag", ""))
+        put("drag", None if self.drag is None else _drag(self.drag))
         put("impratio", _positive(self.impratio, "scene", "impratio", "[-]"))
         put("tolerance", _nonnegative(self.tolerance, "scene", "tolerance", "[-]"))
         put("integrator", _choice(self.integrator, INTEGRATORS, "integrator"))
@@ -371,6 +373,15 @@ def _restitution(value, who, *also):
     return v
 
 
+def _drag(value):
+    if np.ndim(value) == 0:
+        return _nonnegative(value, "scene", "drag", "[1/s]")
+    v = _vector(value, 2, "scene", "drag", "[1/s]")
+    if min(v) < 0:
+        raise ValueError(f"scene: drag = {v} must be finite and >= 0 [1/s]")
+    return v
+
+
 def _vector(value, n, who, field, unit):
     try:
         v = tuple(float(x) for x in value)
@@ -424,7 +435,8 @@ def _solref(value, who):
     v = _vector(value, 2, who, "solref", "")
     if (v[0] > 0) != (v[1] > 0):
         raise ValueError(
-            f"{who}: solref = {v} must be (time constant, damping ratio), both > 0, or (-stiffness, -damping), both <= 0"
+            f"{who}: solref = {v} must be (time constant, damping ratio), both > 0, "
+            "or (-stiffness, -damping), both <= 0"
         )
     return v
 
@@ -776,7 +788,8 @@ def _geom_table(scene):
             taken.add(name)
         names.append(g.name or name)
     group, mask = [g.group for g in geoms], [g.mask for g in geoms]
-    return _GeomTable(tuple(geoms), tuple(names), *(np.array(v, dtype=np.int64) for v in (category, owner, group, mask)))
+    ints = [np.array(v, dtype=np.int64) for v in (category, owner, group, mask)]
+    return _GeomTable(tuple(geoms), tuple(names), *ints)
 
 
 def _find_pairs(scene, table):

@@ -18,9 +18,9 @@ from .bodies import Bodies
 from .detect import detect
 from .model import Model, Params, Structure, batch_of, params
 from .solvers.base import Problem, Solution
-from .solvers.restitution import normal_velocity, targets
-from .solvers.rows import Impulses, InverseInertia, add_rows, take
-from .spatial import Quat, Vec3, qexp, unit_or, where, zeros_like
+from .solvers.restitution import targets
+from .solvers.rows import Impulses, InverseInertia, add_rows, take_tree
+from .spatial import Quat, Vec3, components, qexp, where, zeros_like
 from .state import Kinematic, Memory, State, World, Wrench, to_hot, to_public
 from .status import Status
 from .struct import struct
@@ -44,8 +44,7 @@ def with_memory(model: Model, state: State) -> State:
         shape = (g.slots, g.capacity or len(g.a))
         lam = zero(*shape)
         contacts.append(Impulses(lam, lam, lam) if g.friction else Impulses(lam))
-        varies = g.kind == ("box", "box")
-        feature.append(jnp.full((*batch, shape[1]), -1, jnp.int32) if varies else None)
+        feature.append(jnp.full((*batch, shape[1]), -1, jnp.int32) if g.features else None)
         pairs.append(jnp.full((*batch, shape[1]), len(g.a), jnp.int32) if g.capacity else None)
     L = R = None
     if s.attitude:
@@ -182,7 +181,7 @@ def _freeze(old: World, new: World, p: Params) -> World:
 def _substep(model: Model, p: Params, world: World, wrench: Wrench | None) -> World:
     s, integrator = model.structure, model.method.integrator
     if not s.groups:
-        bodies = integrator.advance(world.bodies, free_force(p, wrench), p.inertia, p.h, one=p.one)
+        bodies = integrator.advance(world.bodies, free_force(p, wrench), p.inertia, p.h)
         return world._with(bodies=bodies, kinematic=_prescribed(p, world.kinematic))
     if model.method.solver.level == "force":
         return _force_step(model, p, world, wrench)
@@ -199,10 +198,20 @@ def _substep(model: Model, p: Params, world: World, wrench: Wrench | None) -> Wo
     L_move = L1
     if solution.w_move is not None:
         L_move = p.inertia.momentum(old.q, solution.w_move)
-    bodies = integrator.move(old, v_move, L_move, p.inertia, p.h, one=p.one)
+    impacts = _impacts(p, problem, solution, v1) if integrator.order >= 2 else None
+    rest, v_rest = solution, v1
+    if impacts is not None:
+        rest = solution._with(contacts=impacts.contacts)
+        v_rest = v1 - impacts.impulse * p.inv_mass
+        if L is not None:
+            L_move = L_move - impacts.turn / p.h
+            L1 = L1 + impacts.balance
+    bodies = integrator.move(old, v_move, L_move, p.inertia, p.h)
     x = bodies.x
     if integrator.order >= 2:
-        x = x + _correction(p, problem, solution, old.v, v1, v_move)
+        x = x + _correction(p, problem, rest, old.v, v_rest)
+    if impacts is not None:
+        x = x + impacts.shift
     bodies = bodies._with(x=x, v=v1, L=L1)
     return _remember(world, bodies, p, contacts, solution)
 
@@ -291,59 +300,93 @@ def _force_step(model: Model, p: Params, world: World, wrench: Wrench | None) ->
         return a, tau
 
     force.constant = False
-    bodies = integrator.advance(world.bodies, force, p.inertia, p.h, one=p.one)
+    bodies = integrator.advance(world.bodies, force, p.inertia, p.h)
     contacts, solution = record[0]
     return _remember(world, bodies, p, contacts, solution)
 
 
-def _correction(p: Params, problem: Problem, solution: Solution, v0: Vec3, v1: Vec3, v_move: Vec3) -> Vec3:
-    """What is added to x + h v_move: the ballistic or tangential half step, and impacts within the step.
+def _correction(p: Params, problem: Problem, solution: Solution, v0: Vec3, v1: Vec3) -> Vec3:
+    """What is added to x + h v: the ballistic or tangential half step.
 
     d = h (v0 - v1) / 2 turns the end velocity into the mean velocity. A body in contact takes only
     its part along the surface (perpendicular to its total normal impulse), which is what makes a
     sliding distance second order without lifting or sinking.
     """
     push = zeros_like(v0)
-    shift = None
     for rows, lam in zip(problem.rows, solution.contacts):
-        total = lam.n.sum(axis=0)
-        push = _spread(push, rows.b, rows.n * total, 1.0)
-        if rows.a is not None:
-            push = _spread(push, rows.a, rows.n * total, -1.0)
-        if rows.e is not None:
-            shift = zeros_like(v0) if shift is None else shift
-            shift = _impact_shift(p, problem, rows, lam, v1, v_move, shift)
+        push = _spread(push, rows, rows.n * lam.n.sum(axis=0))
     push = materialise(push, p.one)
     s = push.dot(push)
     touched = s > 0
     d = (v0 - v1) * (0.5 * p.h)
     along = jnp.where(touched, push.dot(d) / jnp.where(touched, s, 1.0), 0.0)
-    d = d - push * along
-    return d if shift is None else d + shift
+    return d - push * along
 
 
-def _spread(total: Vec3, index, values: Vec3, sign: float) -> Vec3:
-    return Vec3(*(add_rows(t, index, sign * v) for t, v in zip((total.x, total.y, total.z), (values.x, values.y, values.z))))
+def _spread(total: Vec3, rows, values: Vec3) -> Vec3:
+    """``total`` (n, B) with pair values (P, B) added to body B and subtracted from body A."""
+
+    def side(total, index, sign):
+        return Vec3(*(add_rows(t, index, sign * v) for t, v in zip(components(total), components(values))))
+
+    total = side(total, rows.b, 1.0)
+    return total if rows.a is None else side(total, rows.a, -1.0)
 
 
-def _impact_shift(p: Params, problem: Problem, rows, lam: Impulses, v1: Vec3, v_move: Vec3, shift: Vec3) -> Vec3:
-    """Moves bodies so that the gap at the end of the step is that of a bounce at its own instant.
+@struct
+class _Impacts:
+    """Effect of impacts within the step: x + shift, L of the move + turn, L at the end + balance."""
 
-    The gap wanted is u+ left - a left^2 / 2, with u+ the normal velocity reached; the change is
-    shared between the two bodies by inverse mass, so their centre of mass does not move.
+    impulse: Vec3  # of the impacts alone [N s]
+    shift: Vec3
+    turn: Vec3 | None
+    balance: Vec3 | None
+    contacts: tuple[Impulses, ...]  # what is left: the impulses of resting contacts
+
+
+def _impacts(p: Params, problem: Problem, solution: Solution, v1: Vec3) -> _Impacts | None:
+    """Impacts act at their own instant t, not at the start of the step.
+
+    An impulse J at t leaves x at x0 + h v1 - t J / m - h^2 a / 2, and the attitude t longer with the old
+    angular momentum. Between two bodies the shift keeps their centre of mass; the couple of the shifted
+    impulses, t J x (vB - vA), goes to their spins, so that angular momentum is kept to rounding.
     """
-    events = targets(rows, problem)
-    u = normal_velocity(rows, v1, None)
-    um = normal_velocity(rows, v_move, None)
-    want = events.left * (u - 0.5 * events.accel * events.left)
-    gap = jnp.where(events.active, want - rows.phi - p.h * um, 0.0)
-    weight = jnp.where(events.active, lam.n, 0.0)
-    total = weight.sum(axis=0)
-    some = total > 0
-    gap = jnp.where(some, (gap * weight).sum(axis=0) / jnp.where(some, total, 1.0), 0.0)
-    mb = take(p.inv_mass, rows.b)
-    if rows.a is None:
-        return _spread(shift, rows.b, rows.n * gap, 1.0)
-    ma = take(p.inv_mass, rows.a)
-    shift = _spread(shift, rows.b, rows.n * (gap * (mb / (ma + mb))), 1.0)
-    return _spread(shift, rows.a, rows.n * (gap * (ma / (ma + mb))), -1.0)
+    if not any(rows.e is not None for rows in problem.rows):
+        return None
+    zero = zeros_like(problem.v)
+    spin = problem.w is not None
+    impulse, shift = zero, zero
+    turn = balance = zero if spin else None
+    left = []
+    for rows, lam in zip(problem.rows, solution.contacts):
+        if rows.e is None:
+            left.append(lam)
+            continue
+        events = targets(rows, problem)
+        hit, at = events.active, problem.h - events.left
+        mine = jax.tree.map(lambda c: jnp.where(hit, c, 0.0), lam)
+        left.append(jax.tree.map(lambda c: jnp.where(hit, 0.0, c), lam))
+        J = rows.n * mine.n
+        if mine.t1 is not None:
+            t1, t2 = rows.tangents
+            J = J + t1 * mine.t1 + t2 * mine.t2
+        slots = lambda v: v.map(lambda c: c.sum(axis=0))
+        impulse = _spread(impulse, rows, slots(J))
+        late = slots(J * at)
+        shift = _spread(shift, rows, late * -1.0)
+        if not spin:
+            continue
+        both = lambda total, b, a: _spread_sides(total, rows, b, a)
+        turn = both(turn, slots(rows.rb.cross(J) * at), None if rows.a is None else slots(rows.ra.cross(J) * at))
+        if rows.a is not None:
+            couple = late.cross(take_tree(v1, rows.b) - take_tree(v1, rows.a)) * 0.5
+            balance = both(balance, couple, couple * -1.0)
+    return _Impacts(impulse, shift * p.inv_mass, turn, balance, tuple(left))
+
+
+def _spread_sides(total: Vec3, rows, b: Vec3, a: Vec3 | None) -> Vec3:
+    """``total`` with ``b`` added to body B and ``a`` subtracted from body A."""
+    total = Vec3(*(add_rows(t, rows.b, v) for t, v in zip(components(total), components(b))))
+    if a is None:
+        return total
+    return Vec3(*(add_rows(t, rows.a, -v) for t, v in zip(components(total), components(a))))

@@ -1,0 +1,32 @@
+"""Layer 4: contact geometry. ``NARROW`` maps a pair of kinds, in the order of ``SHAPES``, to its narrow phase."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+from .base import Manifold, Pose
+from .box_box import box_box
+from .box_plane import plane_box
+from .sphere_box import sphere_box
+from .sphere_plane import plane_sphere
+from .sphere_sphere import sphere_sphere
+
+
+@dataclasses.dataclass(frozen=True)
+class NarrowPhase:
+    """function(a, b, size_a, size_b, margin, one=None) -> Manifold, and how many slots it returns."""
+
+    function: Callable[..., Manifold]
+    slots: int
+
+
+NARROW: dict[tuple[str, str], NarrowPhase] = {
+    ("plane", "sphere"): NarrowPhase(plane_sphere, 1),
+    ("plane", "box"): NarrowPhase(plane_box, 8),
+    ("sphere", "sphere"): NarrowPhase(sphere_sphere, 1),
+    ("sphere", "box"): NarrowPhase(sphere_box, 1),
+    ("box", "box"): NarrowPhase(box_box, 12),
+}
+
+__all__ = ["Manifold", "NARROW", "NarrowPhase", "Pose"]

@@ -62,7 +62,7 @@ class TGS(Solver):
                 body, lam[k] = _sweep(g, soft[k], lam[k], body, one)
         moving = body
         if self.relax:
-            hard = [_hard(g, moving, problem.h) for g in groups]
+            hard = [_hard(g, l, moving, problem.h) for g, l in zip(groups, lam)]
             for _ in range(self.relax):
                 for k, g in enumerate(groups):
                     body, lam[k] = _sweep(g, hard[k], lam[k], body, one)
@@ -127,13 +127,18 @@ def _law(g: _Group, bias, touching, scale, soft) -> _Law:
     )
 
 
-def _hard(g: _Group, body, h) -> _Law:
-    """The relaxing sweep: no bias on overlap; gaps as they are after the move."""
+def _hard(g: _Group, lam: Impulses, body, h) -> _Law:
+    """The relaxing sweep: no bias on overlap; gaps as they are after the move.
+
+    A gap that did not close in this step is left alone: its impact belongs to the next step.
+    """
     phi = g.rows.phi + h * normal_velocity(g.rows, *body)
     bias = jnp.where(g.rows.phi <= 0, 0.0, jnp.maximum(phi, 0.0) / h)
+    idle = (g.rows.phi > 0) & (lam.n <= 0)
     if g.events is not None:
         bias = jnp.where(g.events.active, -g.events.vhat, bias)
-    return _Law(bias, 1.0, 0.0)
+        idle = idle & ~g.events.active
+    return _Law(bias, jnp.where(idle, 0.0, 1.0).astype(bias.dtype), 0.0)
 
 
 def _prepare(rows: Rows, problem: Problem) -> _Group:
@@ -216,9 +221,8 @@ def _sweep(g: _Group, law: _Law, lam: Impulses, body, one):
     for start, stop in colours:
         def cut(x, axis):
             """This colour's pairs; arrays that are the same for all pairs stay as they are."""
-            if whole or x is None or jnp.ndim(x) == 0:
-                return x
-            return jax.tree.map(lambda c: c if jnp.ndim(c) <= axis or c.shape[axis] == 1 else jax.lax.slice_in_dim(c, start, stop, axis=axis), x)
+            same = lambda c: whole or jnp.ndim(c) <= axis or c.shape[axis] == 1
+            return jax.tree.map(lambda c: c if same(c) else jax.lax.slice_in_dim(c, start, stop, axis=axis), x)
 
         b = Index(rows.b.rows[start:stop])
         a = Index(rows.a.rows[start:stop]) if rows.a is not None else None
@@ -340,11 +344,8 @@ def _sweep_rolled(g: _Group, law: _Law, lam: Impulses, body, one):
     column = jnp.arange(worlds)
 
     def by_pair(x, axis):
-        if x is None or jnp.ndim(x) == 0:
-            return x
-        return jax.tree.map(
-            lambda c: jnp.moveaxis(jnp.broadcast_to(c, c.shape[:axis] + (pairs, c.shape[axis + 1])), axis, 0), x
-        )
+        spread = lambda c: jnp.broadcast_to(c, (*c.shape[:axis], pairs, c.shape[axis + 1]))
+        return jax.tree.map(lambda c: c if jnp.ndim(c) == 0 else jnp.moveaxis(spread(c), axis, 0), x)
 
     static_part = (
         rows.b, rows.a, by_pair(rows.n, 0), by_pair(g.t1, 0), by_pair(g.t2, 0), by_pair(rows.mu, 0),

@@ -1,0 +1,29 @@
+"""Layer 4: sphere (A) and box (B)."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from ..shapes import Box
+from .base import Manifold, Pose
+from .waist import waist
+
+
+def sphere_box(a: Pose, b: Pose, size_a, size_b, margin, one=None) -> Manifold:
+    """One point, from the box's exact SDF at the sphere's centre, outside or inside.
+
+    distance = sdf - r; the normal, from sphere to box, is minus the gradient of the SDF.
+    """
+    (radius,) = size_a
+    local = waist(b.q.rotate_inv(a.x - b.x), one)
+    sdf, gradient = waist(Box.sdf(size_b, local), one)
+    n = waist(-b.q.rotate(gradient), one)
+    gap = sdf - radius
+    point = a.x + n * (radius + 0.5 * gap)
+    return Manifold(
+        normal=n,
+        point=point.map(lambda c: c[None]),
+        distance=gap[None],
+        live=gap[None] < margin,
+        feature=jnp.zeros((1, 1), jnp.int32),
+    )

@@ -1,0 +1,26 @@
+"""Layer 4: plane (A) and sphere (B)."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from ..spatial import Vec3
+from .base import Manifold, Pose
+from .waist import waist
+
+
+def plane_sphere(a: Pose, b: Pose, size_a, size_b, margin, one=None) -> Manifold:
+    """One point: distance = n . (xB - xA) - r along the plane's normal n, its z axis."""
+    (radius,) = size_b
+    q = a.q
+    n = Vec3(2 * (q.x * q.z + q.w * q.y), 2 * (q.y * q.z - q.w * q.x), 1 - 2 * (q.x * q.x + q.y * q.y))
+    gap = waist(n.dot(b.x - a.x) - radius, one)
+    point = b.x - n * (radius + 0.5 * gap)
+    like = gap[None]
+    return Manifold(
+        normal=n.map(lambda c: c + jnp.zeros_like(gap)),
+        point=point.map(lambda c: c[None]),
+        distance=like,
+        live=like < margin,
+        feature=jnp.zeros((1, 1), jnp.int32),
+    )

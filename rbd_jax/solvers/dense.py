@@ -1,0 +1,449 @@
+"""Layer 5: the Newton systems of the convex contact solvers.
+
+A convex contact problem minimises (v - v*)' M (v - v*) / 2 + sum_c l_c(J_c v). Its Newton step needs
+(M + J' G J) d = r, G = the Hessian of l in the contact frame of every point. When no group couples two
+bodies this is one system a body, solved component by component; else one dense matrix a world.
+
+All rows live in the contact frame of their pair, x along t1, y along t2, z along n, which the slots
+of a pair share: the sums over slots are done there and only their results are turned to world axes.
+
+Symbols: r arm in the contact frame; G 3x3 (``Sym3``); K = sum G, C = sum [r]x G, W = sum [r]x G [r]x'
+the force-velocity, torque-velocity and torque-spin blocks of a pair. Row vectors (velocities,
+impulses) are ``Impulses``: the entries t1 and t2 are None without friction.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..spatial import Mat3, Vec3, components
+from ..struct import static, struct
+from ..xla import materialise
+from .base import Problem
+from .rows import Impulses, Index, Rows, add_rows, take, take_tree
+
+
+@struct
+class Sym3:
+    """A symmetric matrix in the contact frame; an entry that is None is zero."""
+
+    zz: jax.Array
+    xx: jax.Array | None = None
+    yy: jax.Array | None = None
+    xy: jax.Array | None = None
+    xz: jax.Array | None = None
+    yz: jax.Array | None = None
+
+    def __matmul__(self, u: Impulses) -> Impulses:
+        n = _add(self.zz * u.n, _mul(self.xz, u.t1), _mul(self.yz, u.t2))
+        if u.t1 is None:
+            return Impulses(n)
+        return Impulses(
+            n,
+            _add(self.xx * u.t1, _mul(self.xy, u.t2), _mul(self.xz, u.n)),
+            _add(self.yy * u.t2, _mul(self.xy, u.t1), _mul(self.yz, u.n)),
+        )
+
+
+@struct
+class Contacts:
+    """A group of rows in the contact frames of its pairs.
+
+    n, t1, t2: the frame in world axes, (P, B). ra, rb: arms in the frame, (S, P, B), None without
+    attitude. a, b: as in ``Rows``.
+    """
+
+    n: Vec3
+    t1: Vec3 | None
+    t2: Vec3 | None
+    live: jax.Array
+    b: Index | jax.Array
+    a: Index | jax.Array | None = None
+    rb: Vec3 | None = None
+    ra: Vec3 | None = None
+    friction: bool = static(default=True)
+
+    def turn(self, v: Vec3) -> Vec3:
+        """World components -> contact frame; the tangential ones are None where nothing uses them."""
+        if self.t1 is None:
+            return Vec3(None, None, self.n.dot(v))
+        return Vec3(self.t1.dot(v), self.t2.dot(v), self.n.dot(v))
+
+    @property
+    def basis(self) -> Mat3:
+        """Rows are world axes, columns the contact frame."""
+        n, a, b = self.n, self.t1, self.t2
+        return Mat3(Vec3(a.x, b.x, n.x), Vec3(a.y, b.y, n.y), Vec3(a.z, b.z, n.z))
+
+
+def contacts(rows: Rows, problem: Problem) -> Contacts:
+    """Put one group into contact frames."""
+    friction = rows.mu is not None
+    central = rows.central_b and (rows.a is None or rows.central_a)
+    spin = problem.w is not None and (friction or not central)
+    t1 = t2 = ra = rb = None
+    if friction or spin:
+        t1, t2 = materialise(rows.tangents, problem.one)
+    if spin:
+        arm = lambda r: materialise(Vec3(t1.dot(r), t2.dot(r), rows.n.dot(r)), problem.one)
+        rb = arm(rows.rb)
+        ra = None if rows.a is None else arm(rows.ra)
+    return Contacts(rows.n, t1, t2, rows.live, rows.b, rows.a, rb, ra, friction)
+
+
+# --- row vectors ---------------------------------------------------------------------------------
+
+
+def row_dot(p: Impulses, u: Impulses) -> jax.Array:
+    return _add(p.n * u.n, _mul(p.t1, u.t1), _mul(p.t2, u.t2))
+
+
+def at_points(c: Contacts, v: Vec3, w: Vec3 | None) -> Impulses:
+    """Relative velocity J (v, w) of every slot; v, w are body velocities (n, B)."""
+
+    def side(index, r):
+        u = c.turn(take_tree(v, index))
+        if r is None:
+            return u
+        s = c.turn(take_tree(w, index))
+        z = u.z + (s.x * r.y - s.y * r.x)
+        if not c.friction:
+            return Vec3(None, None, z)
+        return Vec3(u.x + (s.y * r.z - s.z * r.y), u.y + (s.z * r.x - s.x * r.z), z)
+
+    u = side(c.b, c.rb)
+    if c.a is not None:
+        ua = side(c.a, c.ra)
+        u = Vec3(*(None if p is None else p - q for p, q in zip((u.x, u.y, u.z), (ua.x, ua.y, ua.z))))
+    full = lambda x: jnp.broadcast_to(x, jnp.broadcast_shapes(x.shape, c.live.shape))
+    return Impulses(full(u.z), full(u.x), full(u.y)) if c.friction else Impulses(full(u.z))
+
+
+def on_bodies(cs, ps, problem: Problem) -> tuple[Vec3, Vec3 | None]:
+    """Total impulse and angular impulse J' p on every body, (n, B), from slot impulses of all groups."""
+    zero = jnp.zeros((problem.v.x.shape[0], cs[0].live.shape[-1]), problem.v.x.dtype)
+    force = Vec3(zero, zero, zero)
+    torque = None if problem.w is None else force
+    for c, p in zip(cs, ps):
+        total = p.n.sum(0)
+        world = c.n * total
+        if c.friction:
+            world = world + c.t1 * p.t1.sum(0) + c.t2 * p.t2.sum(0)
+        for index, r, sign in ((c.b, c.rb, 1.0), (c.a, c.ra, -1.0)):
+            if index is None:
+                continue
+            force = _scatter(force, index, world * sign)
+            if r is None:
+                continue
+            x, y = r.y * p.n, -r.x * p.n
+            if c.friction:
+                x, y = x - r.z * p.t2, y + r.z * p.t1
+            turn = c.t1 * x.sum(0) + c.t2 * y.sum(0)
+            if c.friction:
+                turn = turn + c.n * (r.x * p.t2 - r.y * p.t1).sum(0)
+            torque = _scatter(torque, index, turn * sign)
+    return force, torque
+
+
+def response(problem: Problem, impulse: Vec3, turn: Vec3 | None) -> tuple[Vec3, Vec3 | None]:
+    """Velocity changes M^-1 (impulse, angular impulse) of every body."""
+    return impulse * problem.inv_mass, None if turn is None else problem.inv_inertia @ turn
+
+
+def inverse_mass(c: Contacts, problem: Problem) -> jax.Array:
+    """n' (J M^-1 J') n of every slot [1/kg], (S, P, B)."""
+
+    def side(index, r):
+        k = take(problem.inv_mass, index)
+        if r is None:
+            return k
+        inv = take_tree(problem.inv_inertia, index)
+        if inv.yy is None:
+            return k + inv.xx * (r.x * r.x + r.y * r.y)
+        j1, j2 = inv @ c.t1, inv @ c.t2
+        # r x n = t1 r.y - t2 r.x
+        return k + c.t1.dot(j1) * (r.y * r.y) + c.t2.dot(j2) * (r.x * r.x) - 2.0 * c.t1.dot(j2) * (r.x * r.y)
+
+    k = side(c.b, c.rb)
+    if c.a is not None:
+        k = k + side(c.a, c.ra)
+    return jnp.broadcast_to(k, jnp.broadcast_shapes(k.shape, c.live.shape))
+
+
+# --- Newton systems ------------------------------------------------------------------------------
+
+
+def is_coupled(cs) -> bool:
+    return any(c.a is not None for c in cs)
+
+
+def world_inertia(problem: Problem) -> list:
+    """Lower triangle of R I R' of every body, (n, B or 1); None = structural zero."""
+    m = problem.inertia.moments
+    if problem.inertia.isotropic:
+        return [[m], [None, m], [None, None, m]]
+    r = problem.q.mat()
+    a, b, c = r.a, r.b, r.c
+    p, q, s = a * m, b * m, c * m
+    return [[p.dot(a)], [q.dot(a), q.dot(b)], [s.dot(a), s.dot(b), s.dot(c)]]
+
+
+def newton_step(cs, gs, residuals, problem: Problem) -> tuple[Vec3, Vec3 | None]:
+    """d = (M + J' G J)^-1 J' residual, as velocity changes of every body."""
+    rhs = on_bodies(cs, residuals, problem)
+    if is_coupled(cs):
+        return _coupled(cs, gs, rhs, problem)
+    return _uncoupled(cs, gs, rhs, problem)
+
+
+def _uncoupled(cs, gs, rhs, problem: Problem):
+    """One 3x3 or 6x6 system a body."""
+    one = problem.one
+    zero = jnp.zeros_like(rhs[0].x)
+    mass = zero + 1.0 / problem.inv_mass
+    spin = any(c.rb is not None for c in cs)
+    h = [[None] * (i + 1) for i in range(6 if spin else 3)]
+    for i in range(3):
+        h[i][i] = mass
+    if spin:
+        for i, row in enumerate(world_inertia(problem)):
+            for j, x in enumerate(row):
+                h[3 + i][3 + j] = None if x is None else zero + x
+
+    def put(i, j, c, x):
+        if x is not None:
+            h[i][j] = add_rows(zero if h[i][j] is None else h[i][j], c.b, x)
+
+    for c, g in zip(cs, gs):
+        k, cb, wb = _diagonal_blocks(c, g, c.rb, one)
+        for i in range(3):
+            for j in range(3):
+                if j <= i:
+                    put(i, j, c, k[i][j])
+                    if wb is not None:
+                        put(3 + i, 3 + j, c, wb[i][j])
+                if cb is not None:
+                    put(3 + i, j, c, cb[i][j])
+    b = components(rhs[0]) + (components(rhs[1]) if spin else ())
+    x = _small_solve(tuple(tuple(r) for r in h), b, one)
+    if spin:
+        return Vec3(*x[:3]), Vec3(*x[3:])
+    return Vec3(*x), rhs[1]  # no row turns a body: its zero torque is its zero spin
+
+
+def _coupled(cs, gs, rhs, problem: Problem):
+    """One dense system a world: (B, N, N), N = 6 n or, without attitude, 3 n."""
+    one = problem.one
+    n, worlds = rhs[0].x.shape
+    spin = any(c.rb is not None for c in cs)
+    size = 6 if spin else 3
+    zero = jnp.zeros((n, worlds), rhs[0].x.dtype)
+    mass = zero + 1.0 / problem.inv_mass
+    own = [[None] * size for _ in range(size)]
+    for i in range(3):
+        own[i][i] = mass
+    if spin:
+        inertia = world_inertia(problem)
+        for i in range(3):
+            for j in range(i + 1):
+                own[3 + i][3 + j] = own[3 + j][3 + i] = inertia[i][j]
+    body = np.arange(n, dtype=np.int32)
+    h = jnp.zeros((n, n, size, size, worlds), zero.dtype)
+    h = h.at[body, body].add(_stack(own, n, worlds, zero.dtype), unique_indices=True)
+    batch_first = [c for c in cs if not isinstance(c.b, Index)]
+    fixed = [(c, g) for c, g in zip(cs, gs) if isinstance(c.b, Index)]
+    for c, g in fixed:
+        for p, q, blocks in _pair_blocks(c, g, one, size):
+            h = h.at[p.rows, q.rows].add(_stack(blocks, len(p), worlds, zero.dtype))
+    h = jnp.transpose(h, (4, 0, 1, 2, 3))  # (B, n, n, size, size)
+    if batch_first:
+        world = jnp.arange(worlds)[None, :]
+        for c, g in zip(cs, gs):
+            if isinstance(c.b, Index):
+                continue
+            for p, q, blocks in _pair_blocks(c, g, one, size):
+                x = _stack(blocks, p.shape[0], worlds, zero.dtype)
+                h = h.at[world, p, q].add(jnp.transpose(x, (0, 3, 1, 2)))
+    h = jnp.transpose(h, (0, 1, 3, 2, 4)).reshape(worlds, n * size, n * size)
+    b = jnp.stack(components(rhs[0]) + (components(rhs[1]) if spin else ()), axis=1)  # (n, size, B)
+    x = _dense_solve(h, jnp.transpose(b, (2, 0, 1)).reshape(worlds, n * size))
+    x = jnp.transpose(x.reshape(worlds, n, size), (2, 1, 0))
+    if spin:
+        return Vec3(*x[:3]), Vec3(*x[3:])
+    return Vec3(*x), rhs[1]
+
+
+def _pair_blocks(c: Contacts, g: Sym3, one, size: int):
+    """(body row, body column, size x size entries) of every block of J' G J of one group."""
+    k, cb, wb = _diagonal_blocks(c, g, c.rb, one)
+    yield c.b, c.b, _assemble(k, cb, wb, size)
+    if c.a is None:
+        return
+    _, ca, wa = _diagonal_blocks(c, g, c.ra, one)
+    yield c.a, c.a, _assemble(k, ca, wa, size)
+    # row a, column b: -[[K, Cb'], [Ca, Wab]]
+    wab = None if c.ra is None else _rotate(c, _torque_spin(c, g, c.ra, c.rb, one), one)
+    neg = lambda m: None if m is None else [[None if x is None else -x for x in row] for row in m]
+    ab = _assemble(neg(k), neg(ca), neg(wab), size, upper=neg(cb))
+    yield c.a, c.b, ab
+    yield c.b, c.a, [list(row) for row in zip(*ab)]
+
+
+def _assemble(k, c, w, size: int, upper=None):
+    """[[K, U'], [C, W]] with U = C unless given."""
+    m = [[None] * size for _ in range(size)]
+    upper = c if upper is None else upper
+    for i in range(3):
+        for j in range(3):
+            m[i][j] = k[i][j]
+            if c is not None:
+                m[3 + i][j] = c[i][j]
+                m[j][3 + i] = upper[i][j]
+                m[3 + i][3 + j] = w[i][j]
+    return m
+
+
+def _diagonal_blocks(c: Contacts, g: Sym3, r: Vec3 | None, one):
+    """K, C, W of one body of every pair, world axes, entries (P, B)."""
+    if c.t1 is None:  # no tangents at all: K = G n n'
+        gn = materialise(g.zz.sum(0), one)
+        n = components(c.n)
+        return [[n[i] * n[j] * gn for j in range(3)] for i in range(3)], None, None
+    m = _full(g)
+    k = _rotate(c, materialise([[None if x is None else x.sum(0) for x in row] for row in m], one), one)
+    if r is None:
+        return k, None, None
+    torque = [_cross(r, [m[i][j] for i in range(3)]) for j in range(3)]  # columns of [r]x G
+    cb = [[_slots(torque[j][i]) for j in range(3)] for i in range(3)]
+    return k, _rotate(c, materialise(cb, one), one), _rotate(c, _torque_spin(c, g, r, r, one), one)
+
+
+def _torque_spin(c: Contacts, g: Sym3, ra: Vec3, rb: Vec3, one):
+    """Sum of [ra]x G [rb]x' in the contact frame."""
+    m = _full(g)
+    torque = [_cross(ra, [m[i][j] for i in range(3)]) for j in range(3)]
+    w = [_cross(rb, [torque[j][i] for j in range(3)]) for i in range(3)]
+    return materialise([[_slots(x) for x in row] for row in w], one)
+
+
+def _slots(x):
+    return None if x is None else x.sum(0)
+
+
+def _full(g: Sym3):
+    return [[g.xx, g.xy, g.xz], [g.xy, g.yy, g.yz], [g.xz, g.yz, g.zz]]
+
+
+def _mul(a, b):
+    return None if a is None or b is None else a * b
+
+
+def _add(*terms):
+    terms = [t for t in terms if t is not None]
+    return sum(terms[1:], terms[0]) if terms else None
+
+
+def _sub(a, b):
+    if b is None:
+        return a
+    return -b if a is None else a - b
+
+
+def _cross(r: Vec3, u):
+    """r x u for a list u with structural zeros."""
+    return [
+        _sub(_mul(r.y, u[2]), _mul(r.z, u[1])),
+        _sub(_mul(r.z, u[0]), _mul(r.x, u[2])),
+        _sub(_mul(r.x, u[1]), _mul(r.y, u[0])),
+    ]
+
+
+def _rotate(c: Contacts, m, one):
+    """Q m Q' with Q from the contact frame to world axes; entries (P, B)."""
+    q = [components(row) for row in components_rows(c.basis)]
+    half = [[_add(*(_mul(q[i][k], m[k][j]) for k in range(3))) for j in range(3)] for i in range(3)]
+    half = materialise(half, one)
+    return [[_add(*(_mul(half[i][k], q[j][k]) for k in range(3))) for j in range(3)] for i in range(3)]
+
+
+def components_rows(m: Mat3) -> tuple[Vec3, Vec3, Vec3]:
+    return m.a, m.b, m.c
+
+
+def _stack(m, pairs: int, worlds: int, dtype):
+    """(pairs, size, size, B) array from nested lists of (pairs, B or 1) arrays or None."""
+    zero = jnp.zeros((pairs, worlds), dtype)
+    full = lambda x: zero if x is None else jnp.broadcast_to(x, zero.shape)
+    return jnp.stack([jnp.stack([full(x) for x in row], axis=1) for row in m], axis=1)
+
+
+def _scatter(total: Vec3, index, v: Vec3) -> Vec3:
+    return Vec3(*(add_rows(x, index, y) for x, y in zip(components(total), components(v))))
+
+
+# --- linear solves with cheap derivatives ----------------------------------------------------------
+
+
+@jax.custom_jvp
+def _dense_solve(h, b):
+    """h^-1 b for symmetric positive definite h (B, N, N), b (B, N)."""
+    return _substitute(jax.lax.linalg.cholesky(h, symmetrize_input=False), b)
+
+
+@_dense_solve.defjvp
+def _dense_solve_jvp(primals, tangents):
+    (h, b), (dh, db) = primals, tangents
+    factor = jax.lax.linalg.cholesky(h, symmetrize_input=False)
+    x = _substitute(factor, b)
+    return x, _substitute(factor, db - jnp.einsum("bij,bj->bi", dh, x))
+
+
+def _substitute(factor, b):
+    solve = jax.lax.linalg.triangular_solve
+    y = solve(factor, b[..., None], left_side=True, lower=True)
+    return solve(factor, y, left_side=True, lower=True, transpose_a=True)[..., 0]
+
+
+@jax.custom_jvp
+def _small_solve(h, b, one):
+    """x = h^-1 b component by component: h a lower triangle as nested tuples, b a tuple of arrays."""
+    return _small_substitute(_small_factor(h, one), b, one)
+
+
+@_small_solve.defjvp
+def _small_solve_jvp(primals, tangents):
+    (h, b, one), (dh, db, _) = primals, tangents
+    factor = _small_factor(h, one)
+    x = _small_substitute(factor, b, one)
+    n = len(b)
+    at = lambda i, j: dh[i][j] if j <= i else dh[j][i]
+    r = tuple(_sub(db[i], _add(*(_mul(at(i, j), x[j]) for j in range(n)))) for i in range(n))
+    return x, _small_substitute(factor, r, one)
+
+
+def _small_factor(h, one):
+    """h = L D L', L unit lower triangular; every entry is computed once (see ``materialise``)."""
+    n = len(h)
+    low = [[None] * i for i in range(n)]
+    d = []
+    for j in range(n):
+        scaled = [_mul(low[j][k], d[k]) for k in range(j)]
+        d.append(materialise(_sub(h[j][j], _add(*(_mul(low[j][k], scaled[k]) for k in range(j)))), one))
+        for i in range(j + 1, n):
+            x = _sub(h[i][j], _add(*(_mul(low[i][k], scaled[k]) for k in range(j))))
+            low[i][j] = None if x is None else x / d[j]
+    return low, d
+
+
+def _small_substitute(factor, b, one):
+    low, d = factor
+    n = len(b)
+    y = []
+    for i in range(n):
+        y.append(materialise(_sub(b[i], _add(*(_mul(low[i][k], y[k]) for k in range(i)))), one))
+    x = [None] * n
+    for i in reversed(range(n)):
+        x[i] = materialise(_sub(y[i] / d[i], _add(*(_mul(low[k][i], x[k]) for k in range(i + 1, n)))), one)
+    return tuple(x)

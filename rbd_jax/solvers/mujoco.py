@@ -1,0 +1,255 @@
+"""Layer 5: MuJoCo's convex contact problem with the elliptic cone, solved by Newton's method.
+
+The accelerations minimise (a - a_s)' M (a - a_s) / 2 + sum_c s(J_c a - a_ref): see ``mujoco_law`` for a_ref and R.
+With j = J a - a_ref, mu' = mu / sqrt(impratio), D = 1/R, N = mu' j_n, T = mu |j_t|, the force of a point is
+
+    N >= mu' T        0                                                   separating
+    mu' N + T <= 0    -D j_n, -D impratio j_t                             sticking
+    else              f_n = D (mu' T - N) / (mu' (1 + mu'^2)), f_t = -mu f_n j_t / |j_t|    sliding
+
+Everything is multiplied by the step h: velocities x = h j and impulses p = h f.
+
+Source: MuJoCo documentation, "Computation: solver"; compared with ``mj_forward`` of 4.0.1 (``tests/test_newton.py``).
+Differs: fixed iteration counts; the last iteration is a full Newton step. Where no two bodies touch, every body
+has its own step length.
+
+Cost: ``iterations`` linear systems as in ``newton``, and ``iterations x search`` evaluations of the law.
+Gradients: one-step differentiation through the last Newton step (Bolte, Pauwels, Vaiter 2023), exact first derivatives at
+convergence, forward and reverse.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from ..spatial import Vec3
+from ..struct import struct
+from ..xla import materialise
+from . import dense
+from .base import Problem, Solution, Solver
+from .dense import Contacts, Sym3
+from .mujoco_law import MIN_FRICTION, MujocoLaw, impedance, stiffness_damping
+from .rows import Impulses, Rows, add_rows, take
+
+#: Bound of the line search [Newton steps].
+LONGEST = 4.0
+
+
+@dataclasses.dataclass(frozen=True)
+class MujocoNewton(Solver):
+    """MuJoCo's contact forces.
+
+    Attributes:
+      iterations: Newton steps, the last without line search, at least 2. search: line search steps of each.
+      A world is ``unconverged`` where impulses differ from the law at the solution by more than
+      sqrt(machine epsilon) of the largest impulse.
+    """
+
+    iterations: int = 10
+    search: int = 8
+
+    name = "mujoco"
+    level = "force"
+
+    def __post_init__(self):
+        if self.iterations < 2 or self.search < 1:
+            raise ValueError(f"MujocoNewton({self.iterations}, {self.search}): needs 2 iterations and 1 search step")
+
+    def solve(self, problem: Problem) -> Solution:
+        cs = tuple(dense.contacts(rows, problem) for rows in problem.rows)
+        laws = tuple(_law(c, rows, problem) for c, rows in zip(cs, problem.rows))
+        free = tuple(_free(c, law, problem) for c, law in zip(cs, laws))
+        p = self._search_minimum(*jax.lax.stop_gradient((cs, laws, free, problem)))
+        p = materialise(p, problem.one)
+        # one Newton step whose value and derivative both count
+        x = _velocities(cs, free, p, problem)
+        p, x = _newton(cs, laws, p, x, problem)
+        impulse, turn = dense.on_bodies(cs, p, problem)
+        return Solution(
+            impulse=impulse, angular_impulse=turn, contacts=p, unconverged=_unconverged(cs, laws, p, x)
+        )
+
+    def _search_minimum(self, cs, laws, free, problem: Problem):
+        """Newton's method with an exact line search; returns the impulses."""
+        one = problem.one
+        p = tuple(_masked(c, warm) for c, warm in zip(cs, problem.warm))
+        lines = _Lines(cs, problem)
+
+        def newton(carry, _):
+            p, x = materialise(carry, one)
+            linear = materialise(tuple(_cone(law, y) for law, y in zip(laws, x)), one)
+            residual = _minus(tuple(f for f, _ in linear), p)
+            d = materialise(dense.newton_step(cs, tuple(g for _, g in linear), residual, problem), one)
+            dx = materialise(tuple(dense.at_points(c, *d) for c in cs), one)
+            slope, bend = lines.total(p, dx), lines.mass(d)
+
+            def search(_, bracket):
+                t, low, high = bracket
+                linear = tuple(_cone(law, _along(y, lines.at(t, c), dy)) for c, law, y, dy in zip(cs, laws, x, dx))
+                f = slope + t * bend - lines.total(tuple(f for f, _ in linear), dx)
+                df = bend + lines.total(tuple(g @ dy for (_, g), dy in zip(linear, dx)), dx)
+                low, high = jnp.where(f < 0, t, low), jnp.where(f >= 0, t, high)
+                new = t - f / jnp.where(df > 0, df, 1.0)
+                return jnp.where((new > low) & (new < high), new, 0.5 * (low + high)), low, high
+
+            zero = jnp.zeros_like(slope)
+            t, _, _ = jax.lax.fori_loop(0, self.search, search, (zero + 1.0, zero, zero + LONGEST))
+            target = tuple(_minus(f, g @ dy) for (f, g), dy in zip(linear, dx))
+            p = tuple(_along(q, lines.at(t, c), _minus(new, q)) for c, q, new in zip(cs, p, target))
+            x = tuple(_along(y, lines.at(t, c), dy) for c, y, dy in zip(cs, x, dx))
+            return (p, x), None
+
+        x = _velocities(cs, free, p, problem)
+        (p, _), _ = jax.lax.scan(newton, (p, x), length=self.iterations - 1)
+        return p
+
+
+@struct
+class _Law:
+    """Normal and friction stiffness dn, dt = 1/R (zero where no contact acts), mu, mu', reference x = h a_ref."""
+
+    dn: jax.Array
+    reference: Impulses
+    dt: jax.Array | None = None
+    mu: jax.Array | None = None
+    mu_reg: jax.Array | None = None
+
+
+def _law(c: Contacts, rows: Rows, problem: Problem) -> _Law:
+    law: MujocoLaw = rows.law
+    if not isinstance(law, MujocoLaw):
+        raise ValueError("the solver 'mujoco' needs Rows.law = MujocoLaw(...) in every group")
+    h = problem.h
+    weight = take(problem.inv_mass, rows.b)
+    if rows.a is not None:
+        weight = weight + take(problem.inv_mass, rows.a)
+    d = impedance(law, rows.phi)
+    acts = c.live & (rows.phi < law.margin)
+    stiffness = jnp.where(acts, 1.0, 0.0) / jnp.maximum((1.0 - d) / d * weight, 1e-15)
+    k, b = stiffness_damping(law, h, law.timeconst, law.dampratio)
+    u = dense.at_points(c, problem.v0, problem.w0)
+    if rows.surface is not None:
+        s = c.turn(rows.surface)
+        u = _minus(u, Impulses(s.z, s.x, s.y) if c.friction else Impulses(s.z))
+    normal = -h * (b * u.n + k * d * (rows.phi - law.margin))
+    if not c.friction:
+        return materialise(_Law(stiffness, Impulses(normal)), problem.one)
+    if law.timeconst_friction is not None:
+        _, b = stiffness_damping(law, h, law.timeconst_friction, law.dampratio_friction)
+    mu = jnp.maximum(rows.mu, MIN_FRICTION)
+    reference = Impulses(normal, -h * b * u.t1, -h * b * u.t2)
+    tangential = stiffness * law.impratio
+    if law.frictional is not None:
+        tangential = jnp.where(law.frictional, tangential, 0.0)
+        mu = jnp.where(law.frictional, mu, 0.0)
+    return materialise(_Law(stiffness, reference, tangential, mu, mu / jnp.sqrt(law.impratio)), problem.one)
+
+
+def _free(c: Contacts, law: _Law, problem: Problem) -> Impulses:
+    """x = h (J a_s - a_ref)."""
+    dw = None if problem.w is None else problem.w - problem.w0
+    return materialise(_minus(dense.at_points(c, problem.v - problem.v0, dw), law.reference), problem.one)
+
+
+def _velocities(cs, free, p, problem: Problem):
+    """x of every row when the impulses p act."""
+    d = dense.response(problem, *dense.on_bodies(cs, p, problem))
+    return tuple(jax.tree.map(jnp.add, y, dense.at_points(c, *d)) for c, y in zip(cs, free))
+
+
+def _newton(cs, laws, p, x, problem: Problem):
+    """A full Newton step."""
+    one = problem.one
+    linear = materialise(tuple(_cone(law, y) for law, y in zip(laws, x)), one)
+    residual = _minus(tuple(f for f, _ in linear), p)
+    d = materialise(dense.newton_step(cs, tuple(g for _, g in linear), residual, problem), one)
+    dx = materialise(tuple(dense.at_points(c, *d) for c in cs), one)
+    p = tuple(_minus(f, g @ dy) for (f, g), dy in zip(linear, dx))
+    return p, jax.tree.map(jnp.add, x, dx)
+
+
+def _cone(law: _Law, x: Impulses) -> tuple[Impulses, Sym3]:
+    """Impulse of every point and G = -d impulse / dx."""
+    if law.dt is None:
+        g = jnp.where(x.n < 0, law.dn, 0.0)
+        return Impulses(-g * x.n), Sym3(g)
+    mu, reg = law.mu, law.mu_reg
+    s = x.t1 * x.t1 + x.t2 * x.t2
+    moves = (s > 0) & (mu > 0)
+    t = jnp.sqrt(jnp.where(moves, s, 1.0))
+    e1, e2 = jnp.where(moves, x.t1 / t, 0.0), jnp.where(moves, x.t2 / t, 0.0)
+    slip = jnp.where(moves, mu * t, 0.0)
+    normal = reg * x.n
+    separates = jnp.where(mu > 0, normal >= reg * slip, x.n >= 0)
+    sticks = ~separates & (reg * normal + slip <= 0)
+    slides = ~separates & ~sticks
+    # sliding: f_n = c (mu' T - N), c = D / (mu' (1 + mu'^2))
+    c = jnp.where(slides, law.dn, 0.0) / (jnp.where(mu > 0, reg, 1.0) * (1.0 + reg * reg))
+    fn = c * (reg * slip - normal)
+    kn, kt = jnp.where(sticks, law.dn, 0.0), jnp.where(sticks, law.dt, 0.0)
+    force = Impulses(fn - kn * x.n, -mu * fn * e1 - kt * x.t1, -mu * fn * e2 - kt * x.t2)
+    c = c * reg
+    radial = c * mu * mu
+    around = mu * fn / t
+    g = Sym3(
+        kn + c,
+        xx=kt + radial * e1 * e1 + around * e2 * e2,
+        yy=kt + radial * e2 * e2 + around * e1 * e1,
+        xy=(radial - around) * e1 * e2,
+        xz=-c * mu * e1,
+        yz=-c * mu * e2,
+    )
+    return force, g
+
+
+class _Lines:
+    """Sums over what one step length governs: a body where no two bodies touch, else a world."""
+
+    def __init__(self, cs, problem: Problem):
+        self.cs, self.problem, self.coupled = cs, problem, dense.is_coupled(cs)
+
+    def total(self, p, x):
+        """sum p . x over rows: (n, B) or (1, B)."""
+        total = jnp.zeros((self.problem.v.x.shape[0], self.cs[0].live.shape[-1]), self.problem.v.x.dtype)
+        if self.coupled:
+            total = total[:1]
+        for c, q, y in zip(self.cs, p, x):
+            s = dense.row_dot(q, y).sum(0)
+            total = total + s.sum(0, keepdims=True) if self.coupled else add_rows(total, c.b, s)
+        return total
+
+    def mass(self, d: tuple[Vec3, Vec3 | None]):
+        """d' M d."""
+        v, w = d
+        s = v.dot(v) / self.problem.inv_mass
+        if w is not None:
+            s = s + w.dot(self.problem.inertia.momentum(self.problem.q, w))
+        return s.sum(0, keepdims=True) if self.coupled else s
+
+    def at(self, t, c: Contacts):
+        return t if self.coupled else take(t, c.b)
+
+
+def _masked(c: Contacts, p: Impulses) -> Impulses:
+    return jax.tree.map(lambda q: jnp.where(c.live, q, 0.0), p if c.friction else Impulses(p.n))
+
+
+def _along(x: Impulses, t, d: Impulses) -> Impulses:
+    return jax.tree.map(lambda a, b: a + t * b, x, d)
+
+
+def _minus(a, b):
+    return jax.tree.map(lambda x, y: x - y, a, b)
+
+
+def _unconverged(cs, laws, ps, xs) -> jax.Array:
+    worst = largest = 0.0
+    for c, law, p, x in zip(cs, laws, ps, xs):
+        force, _ = _cone(law, x)
+        for q, f in zip(jax.tree.leaves(p), jax.tree.leaves(force)):
+            worst = jnp.maximum(worst, jnp.where(c.live, jnp.abs(q - f), 0.0).max(axis=(0, 1)))
+            largest = jnp.maximum(largest, jnp.where(c.live, jnp.abs(f), 0.0).max(axis=(0, 1)))
+    return worst > jnp.sqrt(jnp.finfo(ps[0].n.dtype).eps) * largest + jnp.finfo(ps[0].n.dtype).tiny

@@ -1,0 +1,243 @@
+"""Layer 5: near-rigid contact with lagged friction, a few Newton steps of a convex problem.
+
+The end-of-step velocities minimise (v - v*)' M (v - v*) / 2 + sum_c l_c(J_c v), whose contact impulses are
+
+    normal    p_n = max((vhat - u_n) / R, 0)                R = beta^2 / (4 pi^2) w N
+    friction  p_t = -mu g0 u_t / D,  D = sqrt(|u_t|^2 + eps^2),  eps = max(v_s, mu sigma w g0)
+
+Symbols: u relative velocity of a point; w inverse mass seen by its normal row; N number of live points of
+the pair, so that the stiffness of a pair does not depend on how many points share the load; vhat = -phi/h,
+at most ``push_speed``; g0 the normal impulse that bounds friction, frozen while the problem is solved.
+
+Sources: Castro et al. 2022 (SAP, near-rigid regularisation); Castro, Han, Masterjohn 2024 (irrotational
+contact fields, "Lagged"). Differs:
+* Primal-dual Newton steps: the active set is that of w p_n + vhat - u_n - R p_n > 0 and the friction law is
+  linearised as D p_t + mu g0 u_t = 0 (Chan, Golub, Mulet 1999). Same solution; the first does not
+  switch a resting contact off for a rounding error of phi, the second needs no line search.
+* Impulses p and velocities advance together so that M (v - v*) = J' p after every step, converged or not:
+  the bodies receive exactly the impulses that are reported, and two bodies exactly opposite ones.
+* g0 is the warm impulse (an estimate from the approach speed where there is none) in the first
+  Newton step and the impulse found by that step in the others: friction does not lag by a time step.
+
+A body that touches only fixed geometry with one sphere has a closed form (exact Coulomb friction).
+
+Cost: ``iterations`` 6x6 systems a body, or dense 6n x 6n systems where bodies touch each other (up to about 16).
+Gradients: exact, of the iteration as it runs, forward and reverse.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..spatial import Vec3, safe_norm
+from ..struct import struct
+from ..xla import materialise
+from . import dense
+from .base import Problem, Solution, Solver
+from .dense import Contacts, Sym3
+from .restitution import targets
+from .rows import Impulses, Index, Rows, add_rows, take
+
+
+@dataclasses.dataclass(frozen=True)
+class NewtonLagged(Solver):
+    """Near-rigid contact with lagged friction.
+
+    Attributes:
+      iterations: Newton steps, at least 2 (one is unsafe).
+      beta: near-rigid parameter [-]; the overlap at rest is beta^2/(4 pi^2) w N p h for a point that
+        carries the impulse p a step.
+      event_beta: the same for an impact with restitution, which is to hit its target velocity.
+      slip_speed: friction is regularised below this speed v_s [m/s]; a held body creeps at a fraction of it.
+      slip_compliance: sigma [-], bounds the stiffness of friction to 1/(sigma w).
+      push_speed: bound of the speed at which overlap is resolved [m/s].
+      tolerance: a world is ``unconverged`` where the residual of a row, as a velocity, exceeds this
+        fraction of the fastest relative velocity (before or wanted) plus slip_speed.
+    """
+
+    iterations: int = 3
+    beta: float = 0.1
+    event_beta: float = 0.02
+    slip_speed: float = 1e-4
+    slip_compliance: float = 1e-3
+    push_speed: float = 3.0
+    tolerance: float = 1e-2
+
+    name = "newton_lagged"
+
+    def __post_init__(self):
+        if self.iterations < 2:
+            raise ValueError(f"NewtonLagged.iterations = {self.iterations}: needs at least 2")
+
+    def solve(self, problem: Problem) -> Solution:
+        if _single_sphere(problem):
+            return self._closed_form(problem)
+        one = problem.one
+        cs = tuple(dense.contacts(rows, problem) for rows in problem.rows)
+        free = tuple(_relative(c, rows, problem.v, problem.w) for c, rows in zip(cs, problem.rows))
+        laws = tuple(self._law(c, rows, problem) for c, rows in zip(cs, problem.rows))
+        p = tuple(_start(c, g) for c, g in zip(cs, problem.warm))
+        start = dense.response(problem, *dense.on_bodies(cs, p, problem))
+        u = tuple(_plus(x, dense.at_points(c, *start)) for c, x in zip(cs, free))
+        bound = tuple(_bound(law, warm.n, x) for law, warm, x in zip(laws, p, free))
+
+        def step(carry, k):
+            p, u, bound = materialise(carry, one)
+            bound = tuple(jnp.where(k == 1, jnp.maximum(q.n, 0.0), g) for q, g in zip(p, bound))
+            linear = tuple(self._linearise(c, *rest) for c, *rest in zip(cs, laws, bound, p, u))
+            linear = materialise(linear, one)
+            residual = tuple(_minus(base, q) for (base, _), q in zip(linear, p))
+            d = materialise(dense.newton_step(cs, tuple(g for _, g in linear), residual, problem), one)
+            du = materialise(tuple(dense.at_points(c, *d) for c in cs), one)
+            u = tuple(_plus(x, dx) for x, dx in zip(u, du))
+            p = tuple(_minus(base, g @ dx) for (base, g), dx in zip(linear, du))
+            return (p, u, bound), None
+
+        (p, u, bound), _ = jax.lax.scan(step, (p, u, bound), jnp.arange(self.iterations))
+        p = materialise(p, one)
+        impulse, turn = dense.on_bodies(cs, p, problem)
+        return Solution(
+            impulse=impulse,
+            angular_impulse=turn,
+            contacts=p,
+            unconverged=self._unconverged(cs, laws, bound, p, u, free),
+        )
+
+    def _law(self, c: Contacts, rows: Rows, problem: Problem) -> _Law:
+        w = dense.inverse_mass(c, problem)
+        points = jnp.maximum(c.live.sum(0), 1).astype(w.dtype)
+        stiff = _near_rigid(self.beta) * points
+        vhat = jnp.minimum(-rows.phi / problem.h, self.push_speed)
+        if rows.e is not None:
+            events = targets(rows, problem)
+            vhat = jnp.where(events.active, events.vhat, vhat)
+            stiff = jnp.where(events.active, _near_rigid(self.event_beta) * points, stiff)
+        law = _Law(w=w, r=stiff * w, vhat=vhat, points=points, mu=rows.mu)
+        return materialise(law, problem.one)
+
+    def _linearise(self, c: Contacts, law: _Law, bound, p: Impulses, u: Impulses) -> tuple[Impulses, Sym3]:
+        """Base and Hessian of the linear model p' = base - G du."""
+        gap = law.vhat - u.n
+        active = c.live & (law.w * p.n + gap - law.r * p.n > 0)
+        gn = jnp.where(active, 1.0, 0.0) / law.r
+        if not c.friction:
+            return Impulses(gn * gap), Sym3(gn)
+        limit, d = self._friction(law, bound, u)
+        limit = jnp.where(c.live, limit, 0.0)
+        m = limit / d
+        # p_t inside the cone (so that the symmetric part stays positive), as a fraction of the bound over D
+        q = p.t1 * p.t1 + p.t2 * p.t2
+        outside = q > limit * limit
+        size = jnp.where(outside, jnp.sqrt(jnp.where(outside, q, 1.0)), jnp.where(limit > 0, limit, 1.0))
+        s = jnp.where(limit > 0, 1.0, 0.0) / (size * d)
+        f1, f2 = p.t1 * s, p.t2 * s
+        g = Sym3(
+            gn,
+            xx=m * (1.0 + f1 * u.t1),
+            yy=m * (1.0 + f2 * u.t2),
+            xy=0.5 * m * (f1 * u.t2 + f2 * u.t1),
+        )
+        return Impulses(gn * gap, -m * u.t1, -m * u.t2), g
+
+    def _friction(self, law: _Law, bound, u: Impulses):
+        """mu g0 and D."""
+        limit = law.mu * bound
+        eps = jnp.maximum(self.slip_compliance * law.w * limit, self.slip_speed)
+        return limit, jnp.sqrt(u.t1 * u.t1 + u.t2 * u.t2 + eps * eps)
+
+    def _unconverged(self, cs, laws, bounds, ps, us, frees) -> jax.Array:
+        worst = scale = 0.0
+        for c, law, bound, p, u, free in zip(cs, laws, bounds, ps, us, frees):
+            r = jnp.abs(law.w * p.n - jnp.maximum(law.w * p.n + law.vhat - u.n - law.r * p.n, 0.0))
+            speed = jnp.maximum(jnp.abs(free.n), jnp.abs(law.vhat))
+            if c.friction:
+                limit, d = self._friction(law, bound, u)
+                e1, e2 = p.t1 + limit * u.t1 / d, p.t2 + limit * u.t2 / d
+                r = jnp.maximum(r, law.w * jnp.maximum(jnp.abs(e1), jnp.abs(e2)))
+                speed = jnp.maximum(speed, jnp.maximum(jnp.abs(free.t1), jnp.abs(free.t2)))
+            worst = jnp.maximum(worst, jnp.where(c.live, r, 0.0).max(axis=(0, 1)))
+            scale = jnp.maximum(scale, jnp.where(c.live, speed, 0.0).max(axis=(0, 1)))
+        return worst > self.tolerance * scale + self.slip_speed
+
+    def _closed_form(self, problem: Problem) -> Solution:
+        """One sphere contact a body: the normal row alone gives p_n, then Coulomb friction stops or slows the slip."""
+        (rows,) = problem.rows
+        one = problem.one
+        c = dense.contacts(rows, problem)
+        u = _relative(c, rows, problem.v, problem.w)
+        law = self._law(c, rows, problem)
+        pn = jnp.where(c.live, jnp.maximum((law.vhat - u.n) / (law.r + law.w), 0.0), 0.0)
+        p = Impulses(pn)
+        if c.friction:
+            k = take(problem.inv_mass, rows.b)
+            if c.rb is not None:
+                k = k + take(problem.inv_inertia.xx, rows.b) * c.rb.z * c.rb.z
+            slip = u.t1 * u.t1 + u.t2 * u.t2
+            slides = slip > (k * law.mu * pn) ** 2
+            s = jnp.where(slides, law.mu * pn / jnp.sqrt(jnp.where(slides, slip, 1.0)), 1.0 / k)
+            s = materialise(jnp.where(c.live, s, 0.0), one)
+            p = Impulses(pn, -s * u.t1, -s * u.t2)
+        p = materialise(p, one)
+        impulse, turn = dense.on_bodies((c,), (p,), problem)
+        return Solution(impulse=impulse, angular_impulse=turn, contacts=(p,))
+
+
+@struct
+class _Law:
+    """w inverse mass, r compliance, vhat target of every normal row (S, P, B); points: live points of a pair."""
+
+    w: jax.Array
+    r: jax.Array
+    vhat: jax.Array
+    points: jax.Array
+    mu: jax.Array | None
+
+
+def _near_rigid(beta: float) -> float:
+    return beta * beta / (4.0 * math.pi**2)
+
+
+def _single_sphere(problem: Problem) -> bool:
+    """One central contact a body with fixed geometry only: the rows do not see each other."""
+    if len(problem.rows) != 1:
+        return False
+    rows = problem.rows[0]
+    alone = rows.a is None and rows.slots == 1 and rows.central_b
+    if not alone or not isinstance(rows.b, Index) or len(np.unique(rows.b.rows)) != len(rows.b):
+        return False
+    return rows.mu is None or problem.w is None or problem.inertia.isotropic
+
+
+def _relative(c: Contacts, rows: Rows, v: Vec3, w: Vec3 | None) -> Impulses:
+    """Velocity of the points relative to the partner, which may move as prescribed."""
+    u = dense.at_points(c, v, w)
+    if rows.surface is None:
+        return u
+    s = c.turn(rows.surface)
+    return _minus(u, Impulses(s.z, s.x, s.y) if c.friction else Impulses(s.z))
+
+
+def _start(c: Contacts, warm: Impulses) -> Impulses:
+    live = lambda x: jnp.where(c.live, x, 0.0)
+    if not c.friction:
+        return Impulses(live(jnp.maximum(warm.n, 0.0)))
+    return Impulses(live(jnp.maximum(warm.n, 0.0)), live(warm.t1), live(warm.t2))
+
+
+def _bound(law: _Law, warm, free: Impulses):
+    """First guess of the normal impulse: the warm one, or this point's share of stopping the approach."""
+    guess = jnp.maximum((law.vhat - free.n) / (law.r + law.w * law.points), 0.0)
+    return jnp.where(warm > 0, warm, guess)
+
+
+def _plus(a, b):
+    return jax.tree.map(lambda x, y: x + y, a, b)
+
+
+def _minus(a, b):
+    return jax.tree.map(lambda x, y: x - y, a, b)
