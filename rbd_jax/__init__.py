@@ -7,8 +7,11 @@
 """
 
 from .build import build
+from .contact.sdf import sdf
+from .convert import from_mujoco, to_mujoco
 from .diagnostics import Contacts, SimulationError, check, contacts, energy, inertia_world, momentum, wrench_at
 from .method import PRESETS, Method
+from .mjcf import load_mjcf, to_mjcf
 from .model import Model
 from .rollout import rollout, step
 from .scene import Body, Geom, Pair, Scene
@@ -39,9 +42,14 @@ __all__ = [
     "check",
     "contacts",
     "energy",
+    "from_mujoco",
     "inertia_world",
+    "load_mjcf",
     "momentum",
     "rollout",
+    "sdf",
     "step",
+    "to_mjcf",
+    "to_mujoco",
     "wrench_at",
 ]

@@ -111,7 +111,7 @@ def build(scene: Scene, dt: float | None = None, method: str | Method = "accurat
         dt=jnp.asarray(dt, dtype),
         mass=jnp.asarray(r.mass, dtype),
         inertia=jnp.asarray(frames.moments, dtype),
-        gravity=has(r.scene.gravity, r.scene.gravity) if r.scene.gravity is not None else None,
+        gravity=None if scene.gravity is None else jnp.asarray(scene.gravity, dtype),
         drag=None if scene.drag is None else jnp.asarray(np.broadcast_to(scene.drag, 2), dtype),
         friction=jnp.asarray(r.geom_friction, dtype) if any_friction else None,
         restitution=jnp.asarray(r.geom_restitution, dtype) if any_restitution else None,

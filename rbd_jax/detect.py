@@ -101,7 +101,8 @@ def _group(s, g: Group, gp: GroupParams, p: Params, world: World, number: int, r
         central_b=g.central_a if flip else g.central_b,
         colours=g.colours,
     )
-    return Contact(m, rows, _warm(g, world, number, pairs, feature), pairs, overflow)
+    warm = jax.tree.map(lambda c: jnp.where(m.live, c, 0.0), _warm(g, world, number, pairs, feature))
+    return Contact(m, rows, warm, pairs, overflow)
 
 
 def min_size(kind, size_a, size_b):

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from rbd_jax.bodies import Bodies, Inertia
-from rbd_jax.integrators import INTEGRATORS, make, matrix_to_quat, polar
-from rbd_jax.integrators import rotation_maps as maps
+from rbd_jax.integrators import INTEGRATORS, make, matrix_to_quat, polar, rotation_maps as maps
 from rbd_jax.integrators.euler_top import EulerTop
 from rbd_jax.spatial import Quat, Vec3, pack
 
@@ -43,7 +42,9 @@ def bodies(omega, moments=BOX, v=(0.0, 0.0, 0.0), q=None, dtype=float):
     omega = np.atleast_2d(omega)
     count = len(omega)
     moments = np.asarray(moments, float)
-    leaf = lambda a: Vec3(*(jnp.asarray(c, dtype)[None, :] for c in np.broadcast_to(a, (count, 3)).T))
+    leaf = lambda a: Vec3(
+        *(jnp.asarray(c, dtype)[None, :] for c in np.broadcast_to(a, (count, 3)).T)
+    )
     q = np.tile([1.0, 0, 0, 0], (count, 1)) if q is None else np.atleast_2d(q)
     q = Quat(*(jnp.asarray(c, dtype)[None, :] for c in q.T))
     if moments.ndim:
@@ -55,7 +56,7 @@ def bodies(omega, moments=BOX, v=(0.0, 0.0, 0.0), q=None, dtype=float):
     return Bodies(leaf(np.zeros(3)), leaf(v), q, L), inertia
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def _runner(name, options):
     integrator = make(name, **dict(options))
 
@@ -124,7 +125,7 @@ class Spring:
         return (a - b.v * 0.4 if self.damped else a), tau
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def spring_reference(damped, duration):
     from scipy.integrate import solve_ivp
 
@@ -266,7 +267,9 @@ def test_agrees_with_mujoco(name):
     mujoco = pytest.importorskip("mujoco")
     rng = np.random.default_rng(3)
     h, n = 0.002, 1000
-    kind = {"mujoco_euler": "Euler", "mujoco_implicitfast": "implicitfast", "mujoco_rk4": "RK4"}[name]
+    kind = {"mujoco_euler": "Euler", "mujoco_implicitfast": "implicitfast", "mujoco_rk4": "RK4"}[
+        name
+    ]
     for turned_by_torque in (False, True):
         for _ in range(3):
             sides = rng.uniform(0.1, 0.5, 3)

@@ -1,4 +1,7 @@
-"""Layer 4: contact geometry. ``NARROW`` maps a pair of kinds, in the order of ``SHAPES``, to its narrow phase."""
+"""Layer 4: contact geometry.
+
+``NARROW`` maps a pair of kinds, in the order of ``SHAPES``, to its narrow phase.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,12 @@ from .sphere_sphere import sphere_sphere
 
 @dataclasses.dataclass(frozen=True)
 class NarrowPhase:
-    """function(a, b, size_a, size_b, margin, one=None) -> Manifold, and how many slots it returns."""
+    """A narrow phase and its number of slots.
+
+    function(a, b, size_a, size_b, margin, one=1.0) -> Manifold, for Poses a and b that broadcast to
+      (P, B), sizes as tuples of arrays (Shape.size), margin [m]: a point is live when its distance
+      is below it. Without a margin that is overlap. one: see ``xla.materialise``.
+    """
 
     function: Callable[..., Manifold]
     slots: int

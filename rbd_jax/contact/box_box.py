@@ -28,7 +28,7 @@ import numpy as np
 
 from ..spatial import Vec3, components, where
 from .base import Manifold, Pose
-from .waist import waist
+from ..xla import materialise
 
 SLOTS = 12
 # An edge axis within acos(0.99) = 8 degrees of the face normal must win by 5 %, any edge axis by 1e-6.
@@ -40,6 +40,9 @@ PARALLEL_SIN2 = 1e-6
 # B's face must win by this fraction of the size; in nearly parallel faces, where the two
 # separations differ by rounding and small tilts, by the larger one, which stops flicker.
 FACE_TIE, PARALLEL_FACE_TIE = 1e-6, 1e-3
+
+# Corners closer than this part of the reference face's half-widths are one, in a manifold with a margin.
+SNAP = 1e-3
 
 BOTH = np.array([-1.0, 1.0])[:, None, None]
 CORNER_X = np.array([-1.0, 1.0, 1.0, -1.0])[:, None, None]
@@ -100,9 +103,7 @@ def _axis(a: Pose, b: Pose, ha, hb):
             j1, j2 = (j + 1) % 3, (j + 2) % 3
             sin2 = sq[i1][j] + sq[i2][j]
             exists = sin2 > PARALLEL_SIN2
-            overlap = (
-                ha[i1] * ar[i2][j] + ha[i2] * ar[i1][j] + hb[j1] * ar[i][j2] + hb[j2] * ar[i][j1]
-            )
+            overlap = ha[i1] * ar[i2][j] + ha[i2] * ar[i1][j] + hb[j1] * ar[i][j2] + hb[j2] * ar[i][j1]
             gap = jnp.abs(t[i2] * r[i1][j] - t[i1] * r[i2][j]) - overlap
             s = gap * jax.lax.rsqrt(jnp.where(exists, sin2, 1.0))
             # squared sine of the angle to the chosen face's normal, times sin2
@@ -121,7 +122,7 @@ def _axis(a: Pose, b: Pose, ha, hb):
     return jnp.where((best_edge > face + gain) & ~merged, number, code)
 
 
-def box_box(a: Pose, b: Pose, size_a, size_b, margin, one=None) -> Manifold:
+def box_box(a: Pose, b: Pose, size_a, size_b, margin, one=1.0) -> Manifold:
     """Twelve slots, at most eight live; see the module's docstring.
 
     With a margin, separated boxes keep the manifold of the best face: the rectangle grows by the
@@ -132,7 +133,7 @@ def box_box(a: Pose, b: Pose, size_a, size_b, margin, one=None) -> Manifold:
     """
     ha, hb = tuple(size_a), tuple(size_b)
     dtype = (a.x.x + b.x.x).dtype
-    code = waist(jax.lax.stop_gradient(_axis(a, b, ha, hb)), one)
+    code = materialise(jax.lax.stop_gradient(_axis(a, b, ha, hb)), one)
     edge = code > 5.5
     ref_b = (code > 2.5) & ~edge
     pair = code - 6.0
@@ -153,21 +154,21 @@ def box_box(a: Pose, b: Pose, size_a, size_b, margin, one=None) -> Manifold:
         rows = [(row.x, row.y, row.z) for row in (R.a, R.b, R.c)]
         first = Vec3(*(_pick(masks, row) for row in rows))
         second = Vec3(*(_pick(masks, row[1:] + row[:1]) for row in rows))
-        first, second = waist((first, second), one)
-        return first, second, waist(first.cross(second), one)
+        first, second = materialise((first, second), one)
+        return first, second, materialise(first.cross(second), one)
 
     def sizes(h, masks):
         return tuple(_pick(masks, h[s:] + h[:s]) for s in range(3))
 
     m, X, Y = axes(q_ref, on_k)
     hm, hX, hY = sizes(h_ref, on_k)
-    d = waist(d, one)
+    d = materialise(d, one)
 
     # incident box: the face most nearly opposed to m (or the edge), c, and its other axes u and w
     g = q_inc.mat().tmul(m).map(jnp.abs)
     opposed = jnp.where((g.x >= g.y) & (g.x >= g.z), 0.0, jnp.where(g.y >= g.z, 1.0, 2.0))
     f = jnp.where(edge, pair - 3.0 * edge_i, opposed.astype(dtype))
-    f = waist(jax.lax.stop_gradient(f), one)
+    f = materialise(jax.lax.stop_gradient(f), one)
     on_f = _one_hot(f)
     c, u, w = axes(q_inc, on_f)
     hc, hu, hw = sizes(h_inc, on_f)
@@ -177,8 +178,8 @@ def box_box(a: Pose, b: Pose, size_a, size_b, margin, one=None) -> Manifold:
     length2 = jnp.where(edge, cross.dot(cross), 1.0)
     n = where(edge, cross * jax.lax.rsqrt(length2), m)
     side = _sign(n.dot(d))
-    n = waist(n * side, one)
-    reach, nu, nw, nX, nY = waist((n.dot(d), n.dot(u), n.dot(w), n.dot(X), n.dot(Y)), one)
+    n = materialise(n * side, one)
+    reach, nu, nw, nX, nY = materialise((n.dot(d), n.dot(u), n.dot(w), n.dot(X), n.dot(Y)), one)
 
     # face: centre of the incident parallelogram, and its height above the reference face
     nc = n.dot(c)
@@ -187,30 +188,35 @@ def box_box(a: Pose, b: Pose, size_a, size_b, margin, one=None) -> Manifold:
     height = reach - jnp.abs(nc) * hc - hm
     separation = height - hu * jnp.abs(nu) - hw * jnp.abs(nw)
 
-    # edges: the point of B's edge (along c) closest to A's edge (along m)
+    # edges: midpoint of the points of A's edge (along m) and B's (along c) closest to each other,
+    # kept on the edges, which they can leave only when the boxes are apart
     sX, sY, su, sw = hX * _sign(nX), hY * _sign(nY), hu * _sign(nu), hw * _sign(nw)
+    mc = m.dot(c)
     vm = m.dot(d) - su * m.dot(u) - sw * m.dot(w)
     vc = c.dot(d) - sX * c.dot(X) - sY * c.dot(Y)
-    along = waist(jnp.clip((m.dot(c) * vm - vc) / length2, -hc, hc), one)
-    nearest = d - u * su - w * sw + c * along
+    on_b = materialise((mc * vm - vc) / length2, one)
+    on_a = materialise(jnp.clip(vm + mc * on_b, -hm, hm), one)
+    middle = (X * sX + Y * sY + m * on_a + d - u * su - w * sw + c * jnp.clip(on_b, -hc, hc)) * 0.5
     gap = reach - jnp.abs(nX) * hX - jnp.abs(nY) * hY - jnp.abs(nu) * hu - jnp.abs(nw) * hw
 
     # what the slots need: distance and midpoint are linear in alpha and beta
-    z0 = waist(jnp.where(edge, gap, height), one)
+    z0 = materialise(jnp.where(edge, gap, height), one)
     Uh, Wh = jnp.where(edge, 0.0, hu), jnp.where(edge, 0.0, hw)
-    Uz, Wz = waist((Uh * nu, Wh * nw), one)
-    P0 = waist(x_ref + where(edge, nearest, centre) - n * (0.5 * z0), one)
-    PU = waist(u * Uh - n * (0.5 * Uz), one)
-    PW = waist(w * Wh - n * (0.5 * Wz), one)
+    Uz, Wz = materialise((Uh * nu, Wh * nw), one)
+    P0 = materialise(x_ref + where(edge, middle, centre - n * (0.5 * z0)), one)
+    PU = materialise(u * Uh - n * (0.5 * Uz), one)
+    PW = materialise(w * Wh - n * (0.5 * Wz), one)
 
     # the parallelogram and the rectangle in the plane (X, Y); in an edge contact anything regular
-    slack = jnp.finfo(dtype).eps ** 0.75 * (hX + hY)
+    # Where the manifold feeds a solver (margin > 0), corners that agree within SNAP are one corner: the slots of
+    # aligned boxes must not come and go with rounding, or their warm-start impulses are lost.
+    slack = jnp.where(margin > 0, SNAP, jnp.finfo(dtype).eps ** 0.75).astype(dtype) * (hX + hY)
     grow = slack + jnp.where(separation > 0, 1.05 * separation, 0.0)
-    HX, HY = waist((hX + grow, hY + grow), one)
-    cx, cy = waist((X.dot(centre), Y.dot(centre)), one)
-    Ux, Wx = waist((jnp.where(edge, hX, hu * X.dot(u)), Wh * X.dot(w)), one)
-    Uy, Wy = waist((Uh * Y.dot(u), jnp.where(edge, hY, hw * Y.dot(w))), one)
-    alpha, beta = waist(_clip(cx, cy, Ux, Uy, Wx, Wy, HX, HY, 1e-6 * slack), one)
+    HX, HY = materialise((hX + grow, hY + grow), one)
+    cx, cy = materialise((X.dot(centre), Y.dot(centre)), one)
+    Ux, Wx = materialise((jnp.where(edge, hX, hu * X.dot(u)), Wh * X.dot(w)), one)
+    Uy, Wy = materialise((Uh * Y.dot(u), jnp.where(edge, hY, hw * Y.dot(w))), one)
+    alpha, beta = materialise(_clip(cx, cy, Ux, Uy, Wx, Wy, HX, HY, jnp.finfo(dtype).eps * slack), one)
     inside = jnp.where(edge, FIRST_SLOT, _corners(alpha, beta))
 
     distance = z0 + alpha * Uz + beta * Wz
@@ -235,21 +241,19 @@ def box_box(a: Pose, b: Pose, size_a, size_b, margin, one=None) -> Manifold:
 def _clip(cx, cy, Ux, Uy, Wx, Wy, HX, HY, tiny):
     """Slots of the overlap of the parallelogram c + alpha U + beta W with |x| <= HX, |y| <= HY.
 
-    Returns alpha and beta, (12, P, B): of the edges beta = -1, 1 the lower ends (2), then the
-    upper ends (2); of the edges alpha = -1, 1 likewise (4); of the rectangle's corners (4). Edges
-    within ``tiny`` [m] of parallel to a side count as parallel.
+    Returns alpha and beta, (12, P, B), clipped to [-1, 1] (an empty edge has both ends at one): of
+    the edges beta = -1, 1 the lower ends (2), then the upper ends (2); of the edges alpha = -1, 1
+    likewise (4); of the rectangle's corners (4). Edges within ``tiny`` [m] of parallel count as parallel.
     """
     tiny = jnp.maximum(tiny, 1e-15)
 
     def interval(x, y, dx, dy):
-        """Parameters in [-1, 1] at which the line (x, y) + s (dx, dy) is in the rectangle."""
+        """Ends, lower > upper if none, of the part of the line (x, y) + s (dx, dy) in the rectangle."""
         ix = 1.0 / jnp.where(jnp.abs(dx) < tiny, tiny, dx)
         iy = 1.0 / jnp.where(jnp.abs(dy) < tiny, tiny, dy)
         rx, ry = HX * jnp.abs(ix), HY * jnp.abs(iy)
         mx, my = -x * ix, -y * iy
-        lo = jnp.maximum(jnp.maximum(mx - rx, my - ry), -1.0)
-        hi = jnp.minimum(jnp.minimum(mx + rx, my + ry), 1.0)
-        return lo, hi
+        return jnp.maximum(mx - rx, my - ry), jnp.minimum(mx + rx, my + ry)
 
     s = jnp.asarray(BOTH, cx.dtype)
     u_ends = interval(cx + s * Wx, cy + s * Wy, Ux, Uy)
@@ -261,7 +265,7 @@ def _clip(cx, cy, Ux, Uy, Wx, Wy, HX, HY, tiny):
     sides = s + jnp.zeros_like(u_ends[0])
     alpha = jnp.concatenate([*u_ends, sides, sides, (x * Wy - y * Wx) * inverse])
     beta = jnp.concatenate([sides, sides, *w_ends, (y * Ux - x * Uy) * inverse])
-    return alpha, beta
+    return jnp.clip(alpha, -1.0, 1.0), jnp.clip(beta, -1.0, 1.0)
 
 
 def _corners(alpha, beta):
@@ -273,7 +277,7 @@ def _corners(alpha, beta):
     down = BOTH > 0
 
     def ends(lo, hi, down):
-        crosses = lo <= hi
+        crosses = lo < hi
         return crosses & (~down | (lo > -1.0)), crosses & (down | (hi < 1.0))
 
     inside = (jnp.abs(alpha[8:]) < 1.0) & (jnp.abs(beta[8:]) < 1.0)

@@ -7,13 +7,13 @@ import numpy as np
 
 from ..spatial import Vec3
 from .base import Manifold, Pose
-from .waist import waist
+from ..xla import materialise
 
 # Corner k of the box has sign + along axis i where bit i of k is set; shape (8, 1, 1) each.
 CORNERS = tuple(((np.arange(8)[:, None, None] >> axis) & 1) * 2.0 - 1.0 for axis in range(3))
 
 
-def plane_box(a: Pose, b: Pose, size_a, size_b, margin, one=None) -> Manifold:
+def plane_box(a: Pose, b: Pose, size_a, size_b, margin, one=1.0) -> Manifold:
     """Eight slots, one per corner: corner c = xB + sum_i s_i U_i, U_i = h_i times the box's axis i.
 
     distance = n . (c - xA), point = c - n distance / 2. Both are linear in the signs s_i, so the
@@ -21,14 +21,14 @@ def plane_box(a: Pose, b: Pose, size_a, size_b, margin, one=None) -> Manifold:
     """
     q = a.q
     n = Vec3(2 * (q.x * q.z + q.w * q.y), 2 * (q.y * q.z - q.w * q.x), 1 - 2 * (q.x * q.x + q.y * q.y))
-    n = waist(n, one)
+    n = materialise(n, one)
     R = b.q.mat()
     columns = (Vec3(R.a.x, R.b.x, R.c.x), Vec3(R.a.y, R.b.y, R.c.y), Vec3(R.a.z, R.b.z, R.c.z))
     sides = tuple(c * h for c, h in zip(columns, size_b))
-    heights = waist(tuple(n.dot(u) for u in sides), one)
-    centre = waist(n.dot(b.x - a.x), one)
-    mids = waist(tuple(u - n * (0.5 * z) for u, z in zip(sides, heights)), one)
-    origin = waist(b.x - n * (0.5 * centre), one)
+    heights = materialise(tuple(n.dot(u) for u in sides), one)
+    centre = materialise(n.dot(b.x - a.x), one)
+    mids = materialise(tuple(u - n * (0.5 * z) for u, z in zip(sides, heights)), one)
+    origin = materialise(b.x - n * (0.5 * centre), one)
 
     def at_corners(start, steps):
         sign = (jnp.asarray(s, start.dtype) for s in CORNERS)

@@ -6,18 +6,18 @@ import jax.numpy as jnp
 
 from ..shapes import Box
 from .base import Manifold, Pose
-from .waist import waist
+from ..xla import materialise
 
 
-def sphere_box(a: Pose, b: Pose, size_a, size_b, margin, one=None) -> Manifold:
+def sphere_box(a: Pose, b: Pose, size_a, size_b, margin, one=1.0) -> Manifold:
     """One point, from the box's exact SDF at the sphere's centre, outside or inside.
 
     distance = sdf - r; the normal, from sphere to box, is minus the gradient of the SDF.
     """
     (radius,) = size_a
-    local = waist(b.q.rotate_inv(a.x - b.x), one)
-    sdf, gradient = waist(Box.sdf(size_b, local), one)
-    n = waist(-b.q.rotate(gradient), one)
+    local = materialise(b.q.rotate_inv(a.x - b.x), one)
+    sdf, gradient = materialise(Box.sdf(size_b, local), one)
+    n = materialise(-b.q.rotate(gradient), one)
     gap = sdf - radius
     point = a.x + n * (radius + 0.5 * gap)
     return Manifold(

@@ -6,15 +6,14 @@ import jax.numpy as jnp
 
 from ..spatial import Vec3
 from .base import Manifold, Pose
-from .waist import waist
 
 
-def plane_sphere(a: Pose, b: Pose, size_a, size_b, margin, one=None) -> Manifold:
+def plane_sphere(a: Pose, b: Pose, size_a, size_b, margin, one=1.0) -> Manifold:
     """One point: distance = n . (xB - xA) - r along the plane's normal n, its z axis."""
     (radius,) = size_b
     q = a.q
     n = Vec3(2 * (q.x * q.z + q.w * q.y), 2 * (q.y * q.z - q.w * q.x), 1 - 2 * (q.x * q.x + q.y * q.y))
-    gap = waist(n.dot(b.x - a.x) - radius, one)
+    gap = n.dot(b.x - a.x) - radius
     point = b.x - n * (radius + 0.5 * gap)
     like = gap[None]
     return Manifold(

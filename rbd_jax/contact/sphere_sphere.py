@@ -6,16 +6,15 @@ import jax.numpy as jnp
 
 from ..spatial import Vec3, safe_norm, unit_or
 from .base import Manifold, Pose
-from .waist import waist
 
 
-def sphere_sphere(a: Pose, b: Pose, size_a, size_b, margin, one=None) -> Manifold:
+def sphere_sphere(a: Pose, b: Pose, size_a, size_b, margin, one=1.0) -> Manifold:
     """One point on the line of centres: distance = |xB - xA| - rA - rB; normal +z at coincident centres."""
     (ra,), (rb,) = size_a, size_b
     d = b.x - a.x
     length = safe_norm(d)
     zero = jnp.zeros_like(length)
-    n = waist(unit_or(d, Vec3(zero, zero, zero + 1)), one)
+    n = unit_or(d, Vec3(zero, zero, zero + 1))
     gap = length - ra - rb
     point = a.x + n * (ra + 0.5 * gap)
     return Manifold(

@@ -53,6 +53,7 @@ def make(integrator: str | Integrator, **options) -> Integrator:
 
 __all__ = [
     "INTEGRATORS",
+    "RK4",
     "BackwardEuler",
     "Buss2",
     "ForwardEuler",
@@ -61,7 +62,6 @@ __all__ = [
     "MujocoEuler",
     "MujocoImplicitFast",
     "MujocoRK4",
-    "RK4",
     "SemiImplicitEuler",
     "Splitting",
     "SymTop2",

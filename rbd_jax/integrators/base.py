@@ -98,4 +98,3 @@ class Splitting(Integrator):
             a, tau = force(end)
             end = half._with(v=add(half.v, a, 0.5 * h), L=add(half.L, tau, 0.5 * h))
         return end
-

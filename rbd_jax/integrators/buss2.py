@@ -12,7 +12,7 @@ from .rotation_maps import exp, norm_correction
 class Buss2(Splitting):
     """One exponential of h w + h^2/2 w' - h^3/12 w' x w (principal frame), w' = -I^-1 (w x L).
 
-    Order 2. Keeps L and |q| to rounding; the energy drifts (not symplectic). 150 flops, 12
+    Order 2. Keeps L and |q| to rounding; the energy drifts (not symplectic). 150 flops, 9
     divisions, 1 square root. Exact for isotropic bodies. Torque enters by half kicks of L.
     Source: Buss 2000 (J. Comp. Phys. 164), "augmented second order"; the same as a Magnus
     expansion with w linear in time.

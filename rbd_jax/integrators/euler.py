@@ -85,7 +85,7 @@ class Euler(Integrator):
 class ForwardEuler(Euler):
     """x, attitude from the velocities at the start; v and L from the forces at the start.
 
-    Order 1; energy and orbits grow. A parabola ends too high by g h t/2. 90 flops.
+    Order 1; energy and orbits grow. A parabola ends too high by g h t/2. 115 flops, 3 divisions, 1 square root.
     """
 
     name: ClassVar[str] = "forward_euler"
@@ -101,7 +101,7 @@ class ForwardEuler(Euler):
 class SemiImplicitEuler(Euler):
     """v and L first, then x from the new v and the attitude from w = I(old attitude)^-1 new L.
 
-    Order 1; symplectic in translation only. A parabola ends too low by g h t/2. 90 flops.
+    Order 1; symplectic in translation only. A parabola ends too low by g h t/2. 115 flops, 3 divisions, 1 square root.
     """
 
     name: ClassVar[str] = "semi_implicit_euler"
@@ -119,8 +119,8 @@ class BackwardEuler(Euler):
 
     Order 1; energy decays. A parabola ends too low by g h t/2. The fixed point is contracted by
     about h|w| an iteration. With a quaternion this is backward Euler itself, since (1 - u)^-1 is
-    parallel to 1 + u; with a matrix it is R <- R + h [w]x R with w of the end. 80 flops an
-    iteration.
+    parallel to 1 + u; with a matrix it is R <- R + h [w]x R with w of the end. 110 flops, 3 divisions and 1 square root
+    an iteration.
     """
 
     name: ClassVar[str] = "backward_euler"

@@ -3,7 +3,7 @@
 MuJoCo carries the angular velocity of the body frame, where w' = I^-1 (R^T tau - w x I w), and so
 keeps neither L nor energy. Here w is recovered from L = R I w at the start of a step and L is
 formed again at its end, with the pose of the end.
-Source: MuJoCo 4.0.1 documentation, "Computation", sections "Integrators" and "Free bodies"; each
+Source: MuJoCo 4.0.1 documentation, "Computation", section "Integrators" and the part on free bodies; each
 compared with the library over 1,000 steps (tests/test_free_motion.py).
 """
 
@@ -23,8 +23,8 @@ from .rotation_maps import dexp_inverse, exp, norm_correction
 class MujocoEuler(Integrator):
     """``Euler``: v, w, then x and q from the new velocities; the gyroscopic term is explicit.
 
-    Order 1. Keeps |q|; |L| and energy grow, without bound for h|w| above about 0.1. 170 flops,
-    8 divisions, 1 square root.
+    Order 1. Keeps |q|; |L| and energy grow, without bound for h|w| above about 0.1. 230 flops,
+    9 divisions, 1 square root.
     """
 
     name = "mujoco_euler"
@@ -56,7 +56,7 @@ class MujocoImplicitFast(MujocoEuler):
 
     w += (I + h d(w x Iw)/dw)^-1 dp, where dp is the explicit change of I w (torque, gyroscopic
     term and contact). Order 1. Keeps |q|; energy and |L| of a tumbling body decay, steady spins
-    are kept. 260 flops, 11 divisions, 1 square root.
+    are kept. 350 flops, 15 divisions, 1 square root.
     """
 
     name = "mujoco_implicitfast"
@@ -75,7 +75,7 @@ class MujocoRK4(Integrator):
     """``RK4`` since 4.0: Runge-Kutta-Munthe-Kaas on (x, v, q, w).
 
     Stages q exp(theta_i), theta' = dexp^-1(theta) w (whole series). Order 4. Keeps |q|; L and
-    energy drift as h^5 a step. 700 flops, 40 divisions, 4 square roots. Free motion only.
+    energy drift as h^5 a step. 740 flops, 30 divisions, 4 square roots. Free motion only.
     Source: Munthe-Kaas 1999 (Appl. Numer. Math. 29); identified by experiment with 4.0.1.
     """
 

@@ -24,7 +24,7 @@ class RK4(Integrator):
     """Classical Runge-Kutta on x, v, the quaternion (normalised at stages and end) and world L.
 
     Order 4 with any force. Keeps L (without torque) and |q| to rounding; the energy drifts as
-    h^5 a step. 350 flops, 16 divisions, 4 square roots; four force evaluations (one if constant).
+    h^5 a step. 480 flops, 12 divisions, 4 square roots; four force evaluations (one if constant).
     Free motion only. Source: Kutta 1901; Hairer, Norsett, Wanner, "Solving ODEs I", II.1.
     """
 

@@ -5,7 +5,8 @@ approximant n/d of the tangent (Lambert's continued fraction) on |t| <= pi, afte
 reduced by whole turns. The result has unit norm by construction whatever n and d are, is smooth
 (also at zero: no |t| in a denominator), and a turn by f(p) about a fixed axis is the exact flow of
 some Hamiltonian F(p), so splittings stay symplectic. Error of the angle: 3e-8 rad in float32,
-1e-15 rad in float64, below rounding both. 5 and 20 times cheaper than XLA's sine and cosine.
+1e-15 rad in float64, below rounding both. 4 and 10 times cheaper than XLA's sine and cosine
+(0.45 against 1.95 ns a pair in float32, 0.9 against 9.7 in float64).
 Reducing by an odd number of turns gives -q in place of q, the same rotation.
 """
 

@@ -6,8 +6,10 @@ Both flows are exact and products of rotations about fixed axes:
     A(t): q <- exp(t L/Iy) q spin_z(t pi_z (1/Iz - 1/Iy))     (a symmetric top about z)
     B(t): q <- q spin_x(t pi_x (1/Ix - 1/Iy)).
 z is the axis whose 1/I is farthest from the other two (``Inertia``), so B is small; it vanishes
-for a symmetric body, whose motion is then exact. All factors exp(t L/Iy) commute with the spins,
-so a whole step needs one of them, at the end.
+for a symmetric body, whose motion is then exact. y should be the middle axis and x the other
+extreme: over 300 random boxes the attitude error is then 1.4 (symtop2) and 2.4 (symtop4) times
+smaller than with x and y exchanged (medians). Any order is correct. All factors exp(t L/Iy) act
+from the left and commute, so a whole step needs one of them, at the end.
 
 L is constant in the world frame by construction; one Newton step towards |q| = 1 is folded into
 that factor. The energy oscillates without drift (the map is symplectic and time-reversible).
@@ -56,7 +58,7 @@ class SymTop2(Splitting):
     """Symmetric-top splitting, B(h/2) A(h) B(h/2); the default.
 
     Order 2. Keeps L and |q| to rounding; energy oscillates without drift; exact for symmetric
-    bodies. 210 flops, 10 divisions, 1 square root, no trigonometric
+    bodies. 280 flops, 12 divisions, 1 square root, no trigonometric
     call (``rotation_maps``).
     """
 
@@ -67,7 +69,7 @@ class SymTop2(Splitting):
         return rotate(q, L, inertia, h, STRANG)
 
 
-# Blanes & Moan 2002 (J. Comp. Appl. Math. 142, table 2, S6): a for B, b for A.
+# Blanes & Moan 2002 (J. Comp. Appl. Math. 142), S6: a for B, b for A.
 _A1, _A2, _A3 = 0.0792036964311957, 0.353172906049774, -0.0420650803577195
 _B1, _B2 = 0.209515106613362, -0.143851773179818
 _HALF = (_A1, _B1, _A2, _B2, _A3, 0.5 - _B1 - _B2)
@@ -85,7 +87,7 @@ class SymTop4(Splitting):
     Order 4 in free rotation, and under forces and torques that are constant or depend on the
     pose (then Suzuki's composition of five kick-drift-kick steps of ``symtop2``); 2 with velocity-
     dependent forces and in ``move``'s kicks. Keeps L and |q| to rounding; energy oscillates
-    without drift. 700 flops, 30 divisions, 1 square root.
+    without drift. 810 flops, 32 divisions, 1 square root.
     """
 
     name = "symtop4"

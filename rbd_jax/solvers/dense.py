@@ -376,7 +376,8 @@ def _stack(m, pairs: int, worlds: int, dtype):
     """(pairs, size, size, B) array from nested lists of (pairs, B or 1) arrays or None."""
     zero = jnp.zeros((pairs, worlds), dtype)
     full = lambda x: zero if x is None else jnp.broadcast_to(x, zero.shape)
-    return jnp.stack([jnp.stack([full(x) for x in row], axis=1) for row in m], axis=1)
+    flat = jnp.stack([full(x) for row in m for x in row], axis=1)
+    return flat.reshape(pairs, len(m), len(m), worlds)
 
 
 def _scatter(total: Vec3, index, v: Vec3) -> Vec3:

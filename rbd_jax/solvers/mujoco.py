@@ -48,7 +48,7 @@ class MujocoNewton(Solver):
       sqrt(machine epsilon) of the largest impulse.
     """
 
-    iterations: int = 10
+    iterations: int = 20
     search: int = 8
 
     name = "mujoco"
