@@ -16,6 +16,7 @@ from .method import Method, find
 from .model import Group, Model, Structure, params
 from .scene import Scene, resolve, rotation
 from .shapes import SHAPES
+from .solvers.mujoco_law import MujocoLaw
 from .spatial import Quat, Vec3
 from .state import Kinematic, Memory, State
 
@@ -96,9 +97,8 @@ def build(scene: Scene, dt: float | None = None, method: str | Method = "accurat
         groups=groups,
         attitude=attitude,
         isotropic=frames.isotropic,
-        axis_shift=frames.shift if attitude and not frames.isotropic else None,
-        size_shift=bool(attitude and not frames.isotropic and plain),
-        restitution_floor=None,
+        axes=frames.axes if attitude and not frames.isotropic else None,
+        resized=bool(attitude and not frames.isotropic and plain),
     )
     if plain:
         geom_pos = geom_quat = None
@@ -149,11 +149,11 @@ class _Frames:
     isotropic: bool
     moments: np.ndarray
     principal: np.ndarray | None
-    shift: np.ndarray
+    axes: np.ndarray  # (n, 3): which body (or principal) axis is the x, y, z of the inner frame
 
 
 def _principal_frames(r) -> _Frames:
-    """Moments, principal frames and which axis is farthest from the other two in 1/I."""
+    """Moments, principal frames and the order of their axes."""
     n = len(r.mass)
     diagonal = np.diagonal(r.inertia, axis1=1, axis2=2).copy()
     moments, frame = diagonal.copy(), np.tile([1.0, 0, 0, 0], (n, 1))
@@ -166,12 +166,15 @@ def _principal_frames(r) -> _Frames:
             moments[i], frame[i] = values, _quat_of(axes)
     equal = np.ptp(moments, axis=1) <= ISOTROPIC * moments.max(axis=1)
     if equal.all():
-        return _Frames(True, moments.mean(axis=1), None, np.full(n, 2))
-    inverse = 1.0 / moments
-    gap = np.stack([np.minimum(abs(inverse[:, k] - inverse[:, k - 1]), abs(inverse[:, k] - inverse[:, k - 2])) for k in range(3)], 1)
-    shift = np.where(equal, 2, np.argmax(gap, axis=1))
+        return _Frames(True, moments.mean(axis=1), None, np.tile([0, 1, 2], (n, 1)))
+    # z: 1/I farthest from the other two; y: the middle one; x: the other extreme (what symtop wants)
+    order = np.argsort(1.0 / moments, axis=1)
+    inverse = np.take_along_axis(1.0 / moments, order, axis=1)
+    low_far = inverse[:, 1] - inverse[:, 0] > inverse[:, 2] - inverse[:, 1]
+    axes = np.where(low_far[:, None], order[:, ::-1], order)
+    axes = np.where(equal[:, None], [0, 1, 2], axes)
     principal = None if _near(frame, [1, 0, 0, 0]).all() else frame
-    return _Frames(False, moments, principal, shift)
+    return _Frames(False, moments, principal, axes)
 
 
 def _quat_of(R: np.ndarray) -> np.ndarray:
@@ -239,7 +242,7 @@ def _groups(r, kinds, category, centred, method: Method, n: int) -> tuple[Group,
         order, colours = _colour(ends) if capacity is None else (np.arange(len(rows)), ())
         groups.append(Group(
             kind, str(k[2]), bool(k[3]), ga[order], gb[order], body_a[order], body_b[order],
-            bool(k[4]), bool(k[5]), bool(k[6]), bool(k[7]), override[rows][order], colours, capacity,
+            bool(k[4]), bool(k[5]), bool(k[6]), bool(k[7]), override[rows][order], rows[order], colours, capacity,
         ))
     return tuple(groups)
 
@@ -272,10 +275,20 @@ def _colour(ends: np.ndarray) -> tuple[np.ndarray, tuple[tuple[int, int], ...]]:
     return order, tuple((int(e - c), int(e)) for c, e in zip(counts, stops))
 
 
-def _mujoco_laws(r, groups, scene, dtype):
-    from .solvers.mujoco_law import group_laws
-
-    return group_laws(r, groups, scene, dtype)
+def _mujoco_laws(r, groups, scene: Scene, dtype) -> tuple[MujocoLaw, ...]:
+    """MuJoCo's softness of the pairs of every group, leaves (P,)."""
+    margin, solref, solimp = r.pair_softness()
+    column = lambda a: jnp.asarray(a, dtype)
+    return tuple(
+        MujocoLaw(
+            *(column(solref[g.rows, k]) for k in range(2)),
+            *(column(solimp[g.rows, k]) for k in range(5)),
+            margin=column(margin[g.rows]),
+            impratio=column([scene.impratio]),
+            refsafe=bool(scene.refsafe),
+        )
+        for g in groups
+    )
 
 
 # --- the start state ---

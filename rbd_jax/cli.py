@@ -589,7 +589,8 @@ def _bench(args) -> int:
     if "error" in rival:
         print(f"\nMuJoCo: cannot run this scene: {rival['error']}")
     else:
-        print(f"\nMuJoCo {rival['version']}, {rival['batch']} rollouts on {rival['threads']} threads\n\n{_five(rival)}")
+        how = f"{rival['integrator']}, {rival['batch']} rollouts on {rival['threads']} threads"
+        print(f"\nMuJoCo {rival['version']}, {how}\n\n{_five(rival)}")
         print(f"\nrbd_jax / MuJoCo: {ours / rival['steps_per_s']:.3g} x")
     return OK
 
@@ -704,7 +705,9 @@ def _bench_mujoco(scene, dt: float, steps: int, every: int, batch: int, args) ->
         rollout.shutdown_persistent_pool()
     runs = [seconds for seconds, _ in timed]
     return {
-        "version": mujoco.__version__, "threads": threads, **_rates(float(np.median(runs)), worlds, steps, dt),
+        "version": mujoco.__version__,
+        "integrator": mujoco.mjtIntegrator(model.opt.integrator).name.removeprefix("mjINT_"),
+        "threads": threads, **_rates(float(np.median(runs)), worlds, steps, dt),
         "runs_s": runs, "penetration_m": gap,
     }  # fmt: skip
 

@@ -25,20 +25,25 @@ SLOP = 0.02
 
 @struct
 class Contact:
-    """A group in one step: its manifold, rows, the chosen pairs and the warm-start impulses."""
+    """A group in one step: its manifold, rows, impulses of the last step, those to start from, the chosen pairs."""
 
     manifold: Manifold
     rows: Rows
+    last: Impulses
     warm: Impulses
     pairs: jax.Array | None
     overflow: jax.Array | None
 
 
-def detect(s: Structure, p: Params, world: World, everything: bool) -> tuple[Contact, ...]:
-    """Contacts of every group. ``everything``: every slot is live however far (else within reach)."""
-    reach = None if everything and not any(g.capacity for g in s.groups) else _reach(p, world)
+def detect(s: Structure, p: Params, world: World, model_of_contact: str | None) -> tuple[Contact, ...]:
+    """Contacts of every group, with the slots alive that the contact model wants.
+
+    "soft": every slot, however far (a distant row does nothing); "near_rigid": those that may touch
+    within the step; "mujoco" and None: those that touch, or are closer than MuJoCo's margin.
+    """
+    reach = _reach(p, world) if model_of_contact == "near_rigid" or any(g.capacity for g in s.groups) else None
     return tuple(
-        _group(s, g, gp, p, world, i, reach, everything) for i, (g, gp) in enumerate(zip(s.groups, p.groups))
+        _group(g, gp, p, world, i, reach, model_of_contact) for i, (g, gp) in enumerate(zip(s.groups, p.groups))
     )
 
 
@@ -49,14 +54,13 @@ def _reach(p: Params, world: World) -> jax.Array:
     return p.h * (safe_norm(bodies.v) + g)
 
 
-def _group(s, g: Group, gp: GroupParams, p: Params, world: World, number: int, reach, everything: bool) -> Contact:
-    worlds = world.bodies.x.x.shape[-1]
+def _group(g: Group, gp: GroupParams, p: Params, world: World, number: int, reach, model_of_contact) -> Contact:
     pairs = overflow = None
     local_a, local_b, size_a, size_b = gp.local_a, gp.local_b, gp.size_a, gp.size_b
     body_a, body_b = Index(g.body_a), Index(g.body_b)
     mu, e, law = gp.mu, gp.e, gp.law
     if g.capacity is not None:
-        pairs, overflow = _choose(s, g, gp, world, reach)
+        pairs, overflow = _choose(g, gp, world, reach)
         chosen = jnp.minimum(pairs, len(g.a) - 1)
         body_a, body_b = (jnp.asarray(rows)[chosen] for rows in (np.maximum(g.body_a, 0), np.maximum(g.body_b, 0)))
         local_a, local_b, size_a, size_b, mu, e, law = take_tree(
@@ -64,8 +68,10 @@ def _group(s, g: Group, gp: GroupParams, p: Params, world: World, number: int, r
         )
     pose_a = _pose(world, _side(g, "a"), body_a, local_a)
     pose_b = _pose(world, _side(g, "b"), body_b, local_b)
-    margin = jnp.inf
-    if not everything:
+    margin = jnp.inf if model_of_contact == "soft" else 0.0
+    if law is not None:
+        margin = law.margin
+    if model_of_contact == "near_rigid":
         near = SLOP * min_size(g.kind, size_a, size_b)
         margin = near + sum(take(reach, i) for c, i in ((_side(g, "a"), body_a), (_side(g, "b"), body_b)) if c == "dynamic")
     m = NARROW[g.kind].function(pose_a, pose_b, size_a, size_b, margin, one=p.one)
@@ -101,8 +107,10 @@ def _group(s, g: Group, gp: GroupParams, p: Params, world: World, number: int, r
         central_b=g.central_a if flip else g.central_b,
         colours=g.colours,
     )
-    warm = jax.tree.map(lambda c: jnp.where(m.live, c, 0.0), _warm(g, world, number, pairs, feature))
-    return Contact(m, rows, warm, pairs, overflow)
+    last = _last(g, world, number, pairs, feature)
+    again = m.live & (last.n > 0)  # negative: an impact
+    warm = jax.tree.map(lambda c: jnp.where(again, c, 0.0), last)
+    return Contact(m, rows, last, warm, pairs, overflow)
 
 
 def min_size(kind, size_a, size_b):
@@ -131,7 +139,7 @@ def _pose(world: World, category: str, index, local: Pose | None) -> Pose:
     return Pose(x + q.rotate(local.x), q @ local.q)
 
 
-def _choose(s: Structure, g: Group, gp: GroupParams, world: World, reach):
+def _choose(g: Group, gp: GroupParams, world: World, reach):
     """Pairs whose bounding boxes, grown by the reach of their bodies, overlap."""
     a = _pose(world, _side(g, "a"), Index(g.body_a), gp.local_a)
     b = _pose(world, _side(g, "b"), Index(g.body_b), gp.local_b)
@@ -144,7 +152,7 @@ def _choose(s: Structure, g: Group, gp: GroupParams, world: World, reach):
     return compact(jnp.broadcast_to(gap < grown, (len(g.a), worlds)), g.capacity)
 
 
-def _warm(g: Group, world: World, number: int, pairs, feature) -> Impulses:
+def _last(g: Group, world: World, number: int, pairs, feature) -> Impulses:
     """Impulses of the last step for the same pair and the same features, zero elsewhere."""
     last = world.contacts[number]
     if pairs is not None:

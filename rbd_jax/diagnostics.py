@@ -113,8 +113,8 @@ def contacts(model: Model, state: State) -> Contacts:
     b = world.bodies
     w = None if b.L is None else p.inertia.velocity(b.q, b.L)
     parts = []
-    for g, gp, c, lam in zip(model.structure.groups, p.groups, detect(model.structure, p, world, True), world.contacts):
-        parts.append(_points(model, g, gp, c, lam if c.pairs is None else c.warm, p, b, w))
+    for g, gp, c in zip(model.structure.groups, p.groups, detect(model.structure, p, world, "soft")):
+        parts.append(_points(model, g, gp, c, c.last._with(n=jnp.abs(c.last.n)), p, b, w))
     shape = b.x.x.shape[-1:]
     if not parts:
         none = jnp.zeros((0, *shape))

@@ -31,7 +31,7 @@ class Group:
     kinematic body. category: what the partner is. flip: the moving body is A, so the normal of the
     narrow phase points away from it. central_*: the geom is a sphere whose centre is the centre of
     mass. friction, restitution: whether any pair has them. capacity: None, or how many pairs are
-    kept at run time. override: rows of the model's pair leaves, -1 = none.
+    kept at run time. override: rows of the model's pair leaves, -1 = none. rows: rows of the resolved pairs.
     """
 
     kind: tuple[str, str]
@@ -46,6 +46,7 @@ class Group:
     friction: bool
     restitution: bool
     override: np.ndarray
+    rows: np.ndarray
     colours: tuple[tuple[int, int], ...] = ()
     capacity: int | None = None
 
@@ -96,7 +97,7 @@ jax.tree_util.register_static(Structure)
 BASE_NDIM = dict(
     dt=0, gravity=1, drag=1, mass=1, friction=1, restitution=1, radius=1, half_extents=2,
     geom_pos=2, geom_quat=2, static_pos=2, static_quat=2, pair_friction=1, pair_restitution=1,
-    com=2, principal=2, solref=2, solimp=2, margin=1,
+    com=2, principal=2,
 )
 
 
@@ -114,7 +115,7 @@ class Model:
       geom_pos, geom_quat: (geoms of bodies, 3 | 4) in the body frame; static_pos, static_quat: of
         static geoms in the world.
       com: (n, 3) centre of mass in the body frame [m]. principal: (n, 4) principal frame in the
-        body frame. solref, solimp, margin: (g, 2), (g, 5), (g,) with the "mujoco" contact model.
+        body frame. laws: MuJoCo's softness per group of pairs, with the "mujoco" contact model.
     """
 
     structure: Structure = static()
@@ -136,9 +137,6 @@ class Model:
     static_quat: jax.Array | None = None
     com: jax.Array | None = None
     principal: jax.Array | None = None
-    solref: jax.Array | None = None
-    solimp: jax.Array | None = None
-    margin: jax.Array | None = None
     laws: object = None
 
     @property
@@ -292,10 +290,7 @@ def params(model: Model, batch: tuple[int, ...], one: jax.Array) -> Params:
     if s.attitude:
         moments = get("inertia")
         if not s.isotropic:
-            m = (moments[:, 0], moments[:, 1], moments[:, 2])
-            shift = s.axis_shift[:, None]  # the body axis that is the principal z
-            pick = lambda k: jnp.where(shift == 2, m[k], jnp.where(shift == 0, m[(k + 1) % 3], m[(k + 2) % 3]))
-            moments = Vec3(pick(0), pick(1), pick(2))
+            moments = Vec3(*_reordered((moments[:, 0], moments[:, 1], moments[:, 2]), s.axes))
         inertia = Inertia(moments)
     gravity = get("gravity")
     drag = get("drag")
@@ -313,8 +308,18 @@ def params(model: Model, batch: tuple[int, ...], one: jax.Array) -> Params:
     )
 
 
-#: Cyclic permutations of the axes: attitude of a frame whose z is the body's x, y or z.
-SHIFTS = np.array([[0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5], [1.0, 0.0, 0.0, 0.0]])
+def _reordered(values, axes: np.ndarray):
+    """The three arrays (k, B) of a quantity per axis, in the order ``axes`` (k, 3) of the inner frame."""
+    pick = lambda k: jnp.where(k == 0, values[0], jnp.where(k == 1, values[1], values[2]))
+    return tuple(values[i] if (axes[:, i] == i).all() else pick(axes[:, i][:, None]) for i in range(3))
+
+
+#: Attitude of a frame whose x, y, z lie along these axes of the body, up to sign (odd orders turn -x).
+_H = np.sqrt(0.5)
+TURNS = {
+    (0, 1, 2): (1.0, 0.0, 0.0, 0.0), (1, 2, 0): (0.5, 0.5, 0.5, 0.5), (2, 0, 1): (0.5, -0.5, -0.5, -0.5),
+    (1, 0, 2): (_H, 0.0, 0.0, -_H), (0, 2, 1): (0.0, 0.0, -_H, -_H), (2, 1, 0): (_H, 0.0, _H, 0.0),
+}
 
 
 def _principal(model: Model, get) -> Quat | None:
@@ -323,9 +328,9 @@ def _principal(model: Model, get) -> Quat | None:
     if not s.attitude:
         return None
     base = None if model.principal is None else _quat(get("principal"))
-    if s.axis_shift is None or (s.axis_shift == 2).all():
+    if s.axes is None or (s.axes == [0, 1, 2]).all():
         return base
-    turn = SHIFTS[s.axis_shift].astype(model.mass.dtype)
+    turn = np.array([TURNS[tuple(a)] for a in s.axes.tolist()], model.mass.dtype)
     turn = Quat(*(jnp.asarray(turn[:, k : k + 1]) for k in range(4)))
     return turn if base is None else base @ turn
 
@@ -341,13 +346,7 @@ def _group_params(model: Model, g: Group, number: int, get, batch) -> GroupParam
         elif kind == "box":
             h = get("half_extents")[rows]
             h = (h[:, 0], h[:, 1], h[:, 2])
-            if moving and s.size_shift:
-                shift = s.axis_shift[bodies][:, None]
-                h = tuple(
-                    jnp.where(shift == 2, h[k], jnp.where(shift == 0, h[(k + 1) % 3], h[(k + 2) % 3]))
-                    for k in range(3)
-                )
-            size = h
+            size = _reordered(h, s.axes[bodies]) if moving and s.resized else h
         if category == "static":
             rows = s.static_row[geoms]
             return size, Pose(_vec3(get("static_pos")[rows]), _quat(get("static_quat")[rows]))

@@ -42,7 +42,8 @@ class Memory:
 
     L: angular momentum the last step ended with, leaves (..., n): the exact value behind omega.
     R: rotation matrix, for integrators that carry one.
-    contacts: impulses of the last step per group, leaves (..., S, P); feature: their codes (..., P);
+    contacts: impulses of the last step per group, leaves (..., S, P); a normal impulse that was an impact is
+      stored negative, as the next step must not start from it. feature: their codes (..., P);
     pairs: the candidate pairs of groups that choose theirs at run time, (..., C).
     """
 

@@ -18,8 +18,8 @@ from .bodies import Bodies
 from .detect import detect
 from .model import Model, Params, Structure, batch_of, params
 from .solvers.base import Problem, Solution
-from .solvers.restitution import targets
-from .solvers.rows import Impulses, InverseInertia, add_rows, take_tree
+from .solvers.restitution import normal_velocity, targets
+from .solvers.rows import Impulses, InverseInertia, Rows, add_rows, take_tree
 from .spatial import Quat, Vec3, components, qexp, where, zeros_like
 from .state import Kinematic, Memory, State, World, Wrench, to_hot, to_public
 from .status import Status
@@ -160,9 +160,9 @@ def free_force(p: Params, wrench: Wrench | None):
 
 def advance(model: Model, p: Params, world: World, wrench: Wrench | None) -> World:
     """One step of dt: ``substeps`` equal parts, then the step counter and the finite check."""
-    new = world
-    for _ in range(model.method.substeps):
-        new = _substep(model, p, new, wrench)
+    part = lambda world, _: (_substep(model, p, world, wrench), None)
+    count = model.method.substeps
+    new = part(world, None)[0] if count == 1 else jax.lax.scan(part, world, None, length=count)[0]
     return _freeze(world, new, p)
 
 
@@ -186,7 +186,7 @@ def _substep(model: Model, p: Params, world: World, wrench: Wrench | None) -> Wo
     if model.method.solver.level == "force":
         return _force_step(model, p, world, wrench)
     old = world.bodies
-    contacts = detect(s, p, world, everything=model.method.contact == "soft")
+    contacts = detect(s, p, world, model.method.contact)
     a, tau = acceleration(p, wrench, old)
     v, L = integrator.kick(old, a, tau, p.inertia, p.h)
     problem = _problem(p, old, v, L, contacts)
@@ -213,7 +213,7 @@ def _substep(model: Model, p: Params, world: World, wrench: Wrench | None) -> Wo
     if impacts is not None:
         x = x + impacts.shift
     bodies = bodies._with(x=x, v=v1, L=L1)
-    return _remember(world, bodies, p, contacts, solution)
+    return _remember(world, bodies, p, contacts, solution, problem)
 
 
 def _problem(p: Params, old: Bodies, v: Vec3, L: Vec3 | None, contacts) -> Problem:
@@ -247,24 +247,37 @@ def _inverse_inertia(p: Params, bodies: Bodies) -> InverseInertia:
     return InverseInertia(ax.dot(r.a), bx.dot(r.b), cx.dot(r.c), ax.dot(r.b), ax.dot(r.c), bx.dot(r.c))
 
 
-def _remember(world: World, bodies: Bodies, p: Params, contacts, solution: Solution) -> World:
+def _remember(world: World, bodies: Bodies, p: Params, contacts, solution: Solution, problem: Problem) -> World:
     status = world.status
     for c in contacts:
         if c.overflow is not None:
             status = status | jnp.where(c.overflow, jnp.uint32(int(Status.CAPACITY)), jnp.uint32(0))
     if solution.unconverged is not None:
         status = status | jnp.where(solution.unconverged, jnp.uint32(int(Status.NOT_CONVERGED)), jnp.uint32(0))
+    lasting = tuple(_marked(c.rows, lam, problem) for c, lam in zip(contacts, solution.contacts))
     shape = lambda new, old: jax.tree.map(lambda a, b: jnp.broadcast_to(a, b.shape).astype(b.dtype), new, old)
     return world._with(
         bodies=bodies,
         kinematic=_prescribed(p, world.kinematic),
-        contacts=tuple(shape(c, w) for c, w in zip(solution.contacts, world.contacts)),
+        contacts=tuple(shape(c, w) for c, w in zip(lasting, world.contacts)),
         feature=tuple(
             None if w is None else shape(c.rows.feature, w) for c, w in zip(contacts, world.feature)
         ),
         pairs=tuple(c.pairs for c in contacts),
         status=status,
     )
+
+
+def _marked(rows: Rows, lam: Impulses, problem: Problem) -> Impulses:
+    """Impulses to remember. Those of a pair that collided in this step are kept with a negative normal part:
+    the next step does not start from them (which would add energy), yet they can be reported.
+
+    A slot collided when it approached faster than twice what this step's acceleration gives.
+    """
+    u0 = normal_velocity(rows, problem.v0, problem.w0)
+    gain = normal_velocity(rows, problem.v, problem.w) - u0
+    hit = (lam.n > 0) & (u0 < -2.0 * jnp.abs(gain))
+    return lam._with(n=jnp.where(hit.any(axis=0), -lam.n, lam.n))
 
 
 def _prescribed(p: Params, k: Kinematic | None) -> Kinematic | None:
@@ -280,7 +293,7 @@ def _force_step(model: Model, p: Params, world: World, wrench: Wrench | None) ->
     record = []
 
     def force(bodies: Bodies):
-        contacts = detect(s, p, world._with(bodies=bodies), everything=True)
+        contacts = detect(s, p, world._with(bodies=bodies), model.method.contact)
         a, tau = acceleration(p, wrench, bodies)
         v, L = bodies.v if a is None else bodies.v + a * p.h, bodies.L
         problem = _problem(p, bodies, v, L, contacts)
@@ -291,7 +304,7 @@ def _force_step(model: Model, p: Params, world: World, wrench: Wrench | None) ->
             push = push if tau is None else push + tau
             problem = problem._with(w=w0 + (problem.inv_inertia @ push) * p.h)
         solution = solver.solve(problem)
-        record.append((contacts, solution))
+        record.append((contacts, solution, problem))
         push = solution.impulse * (p.inv_mass / p.h)
         turn = solution.angular_impulse
         a = push if a is None else a + push
@@ -301,8 +314,7 @@ def _force_step(model: Model, p: Params, world: World, wrench: Wrench | None) ->
 
     force.constant = False
     bodies = integrator.advance(world.bodies, force, p.inertia, p.h)
-    contacts, solution = record[0]
-    return _remember(world, bodies, p, contacts, solution)
+    return _remember(world, bodies, p, *record[0])
 
 
 def _correction(p: Params, problem: Problem, solution: Solution, v0: Vec3, v1: Vec3) -> Vec3:

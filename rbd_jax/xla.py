@@ -18,10 +18,14 @@ def opaque_one(x: jax.Array) -> jax.Array:
     return jnp.exp(jax.lax.stop_gradient(x).ravel()[0] * 0)
 
 
-def materialise(tree, one: jax.Array | float = 1.0):
+def materialise(tree, one: jax.Array | float | None = 1.0):
     """The same values, computed once however many kernels use them (an infinite value becomes NaN).
+
+    ``one`` None leaves the fusion to XLA.
 
     The divisor has the leaf's own shape: XLA turns a division by a broadcast array into a product with
     its reciprocal, which it duplicates again.
     """
+    if one is None:
+        return tree
     return jax.tree.map(lambda x: x / jax.lax.stop_gradient(one + 0.0 * x), tree)

@@ -20,13 +20,10 @@ CORNERS = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)
 
 @pytest.fixture(autouse=True, scope="module")
 def _x64():
-    """Double precision; and quick compilation, since most of the time goes there."""
     old = jax.config.jax_enable_x64
     jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_enable_x64", old)
-    jax.config.update("jax_disable_most_optimizations", False)
 
 
 # --- a small engine: boxes and spheres in the hot layout, rows by hand ---------------------------
@@ -88,6 +85,10 @@ def no_warm(rows):
     return Impulses(z) if rows.mu is None else Impulses(z, z, z)
 
 
+def masked(live, tree):
+    return jax.tree.map(lambda c: jnp.where(live, c, 0.0), tree)
+
+
 def make_problem(rows, state, mass, inertia, h, warm=None, force=None, gyro=True):
     x, q, v, w = state
     dtype = v.x.dtype
@@ -136,7 +137,7 @@ def simulate(solver, state, steps, h, mass, half, mu, stack=True, every=None):
     def step(carry, _):
         state, warm = carry
         rows = make(state)
-        warm = tuple(jax.tree.map(lambda c: jnp.where(r.live, c, 0.0), w) for r, w in zip(rows, warm))
+        warm = tuple(masked(r.live, w) for r, w in zip(rows, warm))
         problem = make_problem(rows, state, mass, inertia, h, warm)
         s = solver.solve(problem)
         new = advance(problem, s, state)
@@ -287,7 +288,7 @@ def test_lagged_column_stands():
     expected = column_overlap(solver, mass, h)
     np.testing.assert_allclose(overlap[:, 0], expected[:, 0], rtol=1e-4)
     np.testing.assert_allclose(overlap[:, 1], expected[:, 1], rtol=0.15)
-    assert float(jnp.abs(v.z).max()) < 1e-8 and float(jnp.abs(v.x).max()) < 1e-4
+    assert float(jnp.abs(v.z).max()) < 1e-6 and float(jnp.abs(v.x).max()) < 1e-4
     assert not np.asarray(history[4][-60:]).any()
 
 
@@ -406,7 +407,8 @@ def tumbling(worlds=4, dtype=jnp.float64, mu=0.5, height=0.0):
     mass = jnp.full((1, 1), 6.0, dtype)
     one = lambda s, m=0.0: jnp.asarray(m + s * rng.normal(size=(1, worlds)), dtype)
     x = Vec3(one(0), one(0), one(1e-3, 0.05 + height))
-    state = (x, qexp(Vec3(one(0.02), one(0.02), one(1))), Vec3(one(1), one(1), one(0.3, -0.3)), Vec3(one(1), one(1), one(1)))
+    turn, v, w = Vec3(one(0.02), one(0.02), one(1)), Vec3(one(1), one(1), one(0.3, -0.3)), Vec3(one(1), one(1), one(1))
+    state = (x, qexp(turn), v, w)
     mu = None if mu is None else jnp.full((1, 1), mu, dtype)
     law = jax.tree.map(lambda c: c if c.dtype == bool else c.astype(dtype), plane_law())
 
@@ -586,17 +588,18 @@ def mujoco_problem(m, d, pairs=(12, 24), dtype=jnp.float64):
             continue
         pad = size - len(items)
         cs = [d.contact[i] for i, *_ in items]
-        a, b = (np.array([x[1 + i] for x in items] + [0] * pad, np.int32) for i in range(2))
-        fill = lambda values, zero: np.array(list(values) + [zero] * pad, float)
-        normal = fill((x[3] * c.frame[:3] for x, c in zip(items, cs)), np.array([0, 0, 1.0]))
-        pos = fill((c.pos for c in cs), np.zeros(3))
+        a = np.array([x[1] for x in items] + [0] * pad, np.int32)
+        b = np.array([x[2] for x in items] + [0] * pad, np.int32)
+        fill = lambda values, zero, pad=pad: np.array(list(values) + [zero] * pad, float)
+        normal = fill([item[3] * c.frame[:3] for item, c in zip(items, cs)], np.array([0, 0, 1.0]))
+        pos = fill([c.pos for c in cs], np.zeros(3))
         laws = [combine(*(geom_law(m, g) for g in c.geom)) for c in cs]
         laws += [PairLaw(1.0, (0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0), 0.0, 0.0, 3)] * pad
         law = jax.tree.map(lambda x: jnp.asarray(x, dtype), law_of_pairs(laws, impratio=m.opt.impratio))
         law = law._with(frictional=jnp.asarray([[p.condim == 3] for p in laws]))
-        slot = lambda v: jax.tree.map(lambda x: x[None], arr(v))
+        slot = lambda v: jax.tree.map(lambda leaf: leaf[None], arr(v))
         rows.append(Rows(
-            n=arr(normal), phi=jnp.asarray(fill((c.dist for c in cs), 0.0), dtype)[None, :, None],
+            n=arr(normal), phi=jnp.asarray(fill([c.dist for c in cs], 0.0), dtype)[None, :, None],
             live=jnp.asarray(np.arange(size) < len(items))[None, :, None], law=law,
             rb=slot(pos - d.xipos[b + 1]), b=jnp.asarray(b)[:, None],
             ra=slot(pos - d.xipos[a + 1]) if dynamic else None, a=jnp.asarray(a)[:, None] if dynamic else None,
@@ -636,18 +639,18 @@ def assert_same_forces(cases, problem, solution, ids_of):
     h = np.asarray(problem.h)
     for world, ((m, d), ids) in enumerate(zip(cases, ids_of)):
         size = max(np.abs(d.efc_force).max(), 1.0) if d.nefc else 1.0
+        col = lambda a, n, world=world: np.stack([np.asarray(c)[:n, world] for c in (a.x, a.y, a.z)], -1)
+        flat = lambda c, n, world=world: np.asarray(c)[0, :n, world, None] / h[world]
         for rows, p, group in zip(problem.rows, solution.contacts, ids):
             n = len(group)
             if not n:
                 continue
-            col = lambda a: np.stack([np.asarray(c)[:n, world] for c in (a.x, a.y, a.z)], -1)
-            flat = lambda c: np.asarray(c)[0, :n, world, None] / h[world]
             t1, t2 = rows.tangents
-            ours = col(rows.n) * flat(p.n) + col(t1) * flat(p.t1) + col(t2) * flat(p.t2)
+            ours = col(rows.n, n) * flat(p.n, n) + col(t1, n) * flat(p.t1, n) + col(t2, n) * flat(p.t2, n)
             theirs = mujoco_forces(m, d, group)
             sign = np.sign((theirs * ours).sum(-1, keepdims=True))
             normal = np.array([d.contact[k].frame[:3] for k in group])
-            assert (sign * (normal * col(rows.n)).sum(-1, keepdims=True) >= 0).all()
+            assert (sign * (normal * col(rows.n, n)).sum(-1, keepdims=True) >= 0).all()
             np.testing.assert_allclose(ours, np.where(sign < 0, -1, 1) * theirs, atol=1e-8 * size)
         # every body's acceleration, spin included
         dv, dw = dense.response(problem, solution.impulse, solution.angular_impulse)

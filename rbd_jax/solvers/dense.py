@@ -439,12 +439,16 @@ def _small_factor(h, one):
 
 
 def _small_substitute(factor, b, one):
+    """x = h^-1 b from the factor; linear in b also in the eyes of JAX, so the divisor that materialises the
+    entries is made of the factor."""
     low, d = factor
     n = len(b)
+    unit = None if one is None else jax.lax.stop_gradient(one + 0.0 * d[0])
+    keep = lambda x: x if unit is None else x / unit
     y = []
     for i in range(n):
-        y.append(materialise(_sub(b[i], _add(*(_mul(low[i][k], y[k]) for k in range(i)))), one))
+        y.append(keep(_sub(b[i], _add(*(_mul(low[i][k], y[k]) for k in range(i))))))
     x = [None] * n
     for i in reversed(range(n)):
-        x[i] = materialise(_sub(y[i] / d[i], _add(*(_mul(low[k][i], x[k]) for k in range(i + 1, n)))), one)
+        x[i] = keep(_sub(y[i] / d[i], _add(*(_mul(low[k][i], x[k]) for k in range(i + 1, n)))))
     return tuple(x)

@@ -14,8 +14,8 @@ Differs: fixed iteration counts; the last iteration is a full Newton step. Where
 has its own step length.
 
 Cost: ``iterations`` linear systems as in ``newton``, and ``iterations x search`` evaluations of the law.
-Gradients: one-step differentiation through the last Newton step (Bolte, Pauwels, Vaiter 2023), exact first derivatives at
-convergence, forward and reverse.
+Gradients: one-step differentiation through the last Newton step (Bolte, Pauwels, Vaiter 2023): exact first
+derivatives at convergence, forward and reverse; second derivatives are wrong.
 """
 
 from __future__ import annotations
@@ -52,6 +52,7 @@ class MujocoNewton(Solver):
     search: int = 8
 
     name = "mujoco"
+    contact = "mujoco"
     level = "force"
 
     def __post_init__(self):
@@ -161,13 +162,15 @@ def _velocities(cs, free, p, problem: Problem):
 
 
 def _newton(cs, laws, p, x, problem: Problem):
-    """A full Newton step."""
+    """A full Newton step. Only the law is differentiated: the derivatives of the linear system are
+    multiplied by the step itself, which is zero at convergence."""
     one = problem.one
     linear = materialise(tuple(_cone(law, y) for law, y in zip(laws, x)), one)
     residual = _minus(tuple(f for f, _ in linear), p)
-    d = materialise(dense.newton_step(cs, tuple(g for _, g in linear), residual, problem), one)
+    cs, gs, problem = jax.lax.stop_gradient((cs, tuple(g for _, g in linear), problem))
+    d = materialise(dense.newton_step(cs, gs, residual, problem), one)
     dx = materialise(tuple(dense.at_points(c, *d) for c in cs), one)
-    p = tuple(_minus(f, g @ dy) for (f, g), dy in zip(linear, dx))
+    p = tuple(_minus(f, g @ dy) for (f, _), g, dy in zip(linear, gs, dx))
     return p, jax.tree.map(jnp.add, x, dx)
 
 

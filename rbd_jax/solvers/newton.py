@@ -34,14 +34,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..spatial import Vec3, safe_norm
+from ..spatial import Vec3
 from ..struct import struct
 from ..xla import materialise
 from . import dense
 from .base import Problem, Solution, Solver
 from .dense import Contacts, Sym3
 from .restitution import targets
-from .rows import Impulses, Index, Rows, add_rows, take
+from .rows import Impulses, Index, Rows, take
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,6 +69,7 @@ class NewtonLagged(Solver):
     tolerance: float = 1e-2
 
     name = "newton_lagged"
+    contact = "near_rigid"
 
     def __post_init__(self):
         if self.iterations < 2:
