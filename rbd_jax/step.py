@@ -19,7 +19,7 @@ from .detect import detect
 from .model import Model, Params, Structure, batch_of, params
 from .solvers.base import Problem, Solution
 from .solvers.restitution import normal_velocity, targets
-from .solvers.rows import Impulses, InverseInertia, Rows, add_rows, take_tree
+from .solvers.rows import Impulses, InverseInertia, Rows, add_rows, take, take_tree
 from .spatial import Quat, Vec3, components, qexp, where, zeros_like
 from .state import Kinematic, Memory, State, World, Wrench, to_hot, to_public
 from .status import Status
@@ -272,11 +272,14 @@ def _marked(rows: Rows, lam: Impulses, problem: Problem) -> Impulses:
     """Impulses to remember. Those of a pair that collided in this step are kept with a negative normal part:
     the next step does not start from them (which would add energy), yet they can be reported.
 
-    A slot collided when it approached faster than twice what this step's acceleration gives.
+    A slot collided when it approached faster than twice what this step's accelerations give its bodies.
     """
     u0 = normal_velocity(rows, problem.v0, problem.w0)
-    gain = normal_velocity(rows, problem.v, problem.w) - u0
-    hit = (lam.n > 0) & (u0 < -2.0 * jnp.abs(gain))
+    kick = problem.v - problem.v0
+    gain = jnp.sqrt(take(kick.dot(kick), rows.b))
+    if rows.a is not None:
+        gain = gain + jnp.sqrt(take(kick.dot(kick), rows.a))
+    hit = (lam.n > 0) & (u0 < -2.0 * jax.lax.stop_gradient(gain))
     return lam._with(n=jnp.where(hit.any(axis=0), -lam.n, lam.n))
 
 
