@@ -118,7 +118,7 @@ def number(x, digits=3) -> str:
 
 
 def verdict(value, bar, least=False) -> str:
-    """"" without a bar, else "ok" or "MISS"; a value that is missing or not finite misses."""
+    """Empty without a bar, else "ok" or "MISS"; a value that is missing or not finite misses."""
     if bar is None:
         return ""
     if value is None or not np.isfinite(value):
@@ -130,7 +130,10 @@ def verdict(value, bar, least=False) -> str:
 
 
 class Program:
-    """``rollout`` of a batch, compiled ahead of time from cold caches; ``trace_s``, ``lower_s``, ``compile_s``.
+    """A function of a batch, compiled ahead of time; seconds in ``trace_s``, ``lower_s``, ``compile_s``.
+
+    Cold as long as no program of the same scene, batch and length was traced before in this process; nothing is
+    read from disk unless the user has set up JAX's persistent cache.
 
     Args:
       function: (model, state) -> what is to be timed.
@@ -138,7 +141,6 @@ class Program:
 
     def __init__(self, function, model, state):
         jax.block_until_ready(jax.jit(lambda x: x + 1)(jnp.zeros(3)))  # the backend itself is up
-        jax.clear_caches()
         begin = time.perf_counter()
         traced = jax.jit(function).trace(model, state)
         self.trace_s = time.perf_counter() - begin

@@ -435,6 +435,7 @@ def main(args) -> int:
         return 2
     if args.smoke:
         chosen, args.repeats = ["ball", "isotropic"], 2
+    print(common.header(env), flush=True)
     rows, extra = [], {}
 
     def keep(new):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from .integrators import Integrator, make as make_integrator
-from .solvers import SOLVERS, Solver
+from .solvers import SOLVERS, NewtonLagged, Solver
 
 #: Longest substep of ``substeps=None`` with the TGS solver [s].
 SUBSTEP = 1.0 / 240.0
@@ -61,13 +61,18 @@ class Method:
         substeps = self.substeps
         if substeps is None:
             substeps = max(1, round(dt / SUBSTEP + 0.49)) if solver.name == "tgs" else 1
+        if substeps > MAX_SUBSTEPS:
+            raise ValueError(f"Method: dt = {dt} s needs {substeps} substeps, at most {MAX_SUBSTEPS}: use a smaller dt")
         return Method(integrator, contact, solver, substeps, self.capacity)
 
 
+#: Substeps are a compiled loop, but a step that needs more than this is a wrong dt.
+MAX_SUBSTEPS = 1000
+
 PRESETS = {
     "fast": Method("symtop2", "soft", "tgs"),
-    "accurate": Method("symtop4", "near_rigid", "newton_lagged"),
-    "gradient": Method("symtop2", "near_rigid", "newton_lagged"),
+    "accurate": Method("symtop4", "near_rigid", NewtonLagged(iterations=8)),
+    "gradient": Method("symtop2", "near_rigid", NewtonLagged(iterations=8)),
     "mujoco": Method("scene", "mujoco", "mujoco"),
 }
 

@@ -88,11 +88,15 @@ def test_stack_of_five_stands(method):
 
 def test_contact_kinds_are_told_apart():
     model, state = rbd.build(scenes.ball(restitution=0.8), method="fast")
-    _, traj = rbd.rollout(model, state, 120)
-    seen = rbd.contacts(model, traj)
-    distance, kind = np.asarray(seen.distance)[:, 0], np.asarray(seen.kind)[:, 0]
-    assert kind[0] == 0 and not np.asarray(seen.live)[0, 0] and distance[0] == pytest.approx(1.0)
-    assert 3 in kind  # leaves the ground after the impact
+    seen = rbd.contacts(model, state)
+    assert int(seen.kind[0]) == 0 and not bool(seen.live[0]) and float(seen.distance[0]) == pytest.approx(1.0)
+    touching, _ = rbd.rollout(model, state.replace(pos=jnp.array([[0, 0, 0.0999]]), vel=jnp.array([[0, 0, -2.0]])), 0)
+    assert int(rbd.contacts(model, touching).kind[0]) == 2
+    bounced = rbd.step(model, touching)
+    seen = rbd.contacts(model, bounced)
+    assert int(seen.kind[0]) == 3 and bool(seen.live[0])
+    impulse = float(model.mass[0]) * (1.8 * 2.0)
+    assert float(seen.force[0, 2]) / 240 == pytest.approx(impulse, rel=1e-2)
     model, state = rbd.build(scenes.ball(0.1), method="fast")
     final, _ = rbd.rollout(model, state, 240)
     seen = rbd.contacts(model, final)
