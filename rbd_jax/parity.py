@@ -98,13 +98,16 @@ def validate(scene: Scene, method: str | None = None, steps: int | None = None) 
     notes = []
     if any(g.restitution is not None for b in scene.bodies for g in b.geoms):
         notes.append("MuJoCo has no restitution coefficient: it is left out of the comparison.")
+    if scene.kinematic:
+        notes.append("MuJoCo's mocap bodies do not move by themselves: kinematic bodies are compared at rest.")
     if scene.drag is not None:
         notes.append("MuJoCo has no drag per mass: it is left out of the comparison.")
     with jax.enable_x64(True):
         mj, data = compile_mujoco(scene)
         mj.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
         mj.opt.tolerance, mj.opt.iterations = 0.0, 100
-        plain = dataclasses.replace(scene, drag=None)
+        still = tuple(dataclasses.replace(b, vel=None, omega=None) for b in scene.kinematic)
+        plain = dataclasses.replace(scene, drag=None, kinematic=still)
         qpos, qvel = _trajectory(mujoco, mj, data, steps)
         model, start = build(plain, method="mujoco")
         rows = _forward(mujoco, mj, model, start, qpos[0], qvel[0])

@@ -254,7 +254,9 @@ def _remember(world: World, bodies: Bodies, p: Params, contacts, solution: Solut
             status = status | jnp.where(c.overflow, jnp.uint32(int(Status.CAPACITY)), jnp.uint32(0))
     if solution.unconverged is not None:
         status = status | jnp.where(solution.unconverged, jnp.uint32(int(Status.NOT_CONVERGED)), jnp.uint32(0))
-    lasting = tuple(_marked(c.rows, lam, problem) for c, lam in zip(contacts, solution.contacts))
+    lasting = solution.contacts
+    if solution.warm:
+        lasting = tuple(_marked(c.rows, lam, problem) for c, lam in zip(contacts, lasting))
     shape = lambda new, old: jax.tree.map(lambda a, b: jnp.broadcast_to(a, b.shape).astype(b.dtype), new, old)
     return world._with(
         bodies=bodies,

@@ -9,7 +9,7 @@ import jax
 
 from ..bodies import Inertia
 from ..spatial import Quat, Vec3
-from ..struct import struct
+from ..struct import static, struct
 from .rows import Impulses, InverseInertia, Rows
 
 
@@ -53,6 +53,7 @@ class Solution:
       v_move, w_move: velocities that move the poses in this step where they differ from the
         end-of-step velocities (position bias), else None.
       unconverged: bool (B,) or None.
+      warm: whether the next step starts from these impulses (a closed form does not).
     """
 
     impulse: Vec3
@@ -61,6 +62,7 @@ class Solution:
     v_move: Vec3 | None = None
     w_move: Vec3 | None = None
     unconverged: jax.Array | None = None
+    warm: bool = static(default=True)
 
 
 @dataclasses.dataclass(frozen=True)

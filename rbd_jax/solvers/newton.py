@@ -185,7 +185,7 @@ class NewtonLagged(Solver):
             p = Impulses(pn, -s * u.t1, -s * u.t2)
         p = materialise(p, one)
         impulse, turn = dense.on_bodies((c,), (p,), problem)
-        return Solution(impulse=impulse, angular_impulse=turn, contacts=(p,))
+        return Solution(impulse=impulse, angular_impulse=turn, contacts=(p,), warm=False)
 
 
 @struct

@@ -81,4 +81,5 @@ def solve(problem: Problem, recovery) -> Solution:
         angular_impulse=turn,
         contacts=(Impulses(end[None], t1, t2),),
         v_move=problem.v + (impulse + spread(n * (moving - end))) * problem.inv_mass,
+        warm=False,
     )
