@@ -345,7 +345,8 @@ def shipped(names, begin, budget):
             out[name] = report.to_dict() | {"seconds": time.perf_counter() - t}
         except Exception as error:  # MuJoCo's FatalError derives from Exception alone
             out[name] = {"skipped": str(error).splitlines()[0]}
-        print(f"  {name}: {out[name].get('ok', out[name].get('skipped'))}  ({time.perf_counter() - begin:.0f} s)", flush=True)
+        result = out[name].get("ok", out[name].get("skipped"))
+        print(f"  {name}: {result}  ({time.perf_counter() - begin:.0f} s)", flush=True)
     return out
 
 
@@ -382,7 +383,9 @@ def report(data):
 
     def bars(key):
         bar = FIGURES[key][2]
-        return " / ".join(f"{b:g}" for b in bar.values()) if isinstance(bar, dict) else "-" if bar is None else f"{bar:g}"
+        if isinstance(bar, dict):
+            return " / ".join(f"{b:g}" for b in bar.values())
+        return "-" if bar is None else f"{bar:g}"
 
     rows = [[w, u, bars(k), *(cell(k, m) for m in methods)] for k, (w, u, _) in FIGURES.items()]
     heights = [[str(k + 1), number(0.64 ** (k + 1), 5)] for k in range(5)]
@@ -400,21 +403,24 @@ def report(data):
             bound = "-" if k["bound"] is None else number(k["bound"], 2)
             parts.append([name, k["level"], k["quantity"], f"{number(k['value'])} {k['unit']}".strip(), bound, ok])
     missed = data["misses"]
+    verdict = f"{len(missed)} misses" + (": " + "; ".join(missed) if missed else "") + "."
+    if data["smoke"]:
+        verdict = "Smoke run: much too short, nothing is judged."
     return f"""# Contact response and agreement with MuJoCo
 
 {common.header(data["environment"])}
-Made by `benchmarks/physics.py` in {data["seconds"]:.0f} s. Float32, 1/240 s unless said. MuJoCo: itself at a tenth of the
-step with its default contact (float64, elliptic cone, Newton); it is shown, not judged. The "mujoco" preset has MuJoCo's contact,
-soft and without restitution: judged on poses alone in this table, and at equal step below.
+Made by `benchmarks/physics.py` in {data["seconds"]:.0f} s. Float32, 1/240 s unless said. MuJoCo: itself at a
+tenth of the step with its default contact (float64, elliptic cone, Newton); it is shown, not judged. The "mujoco" preset
+has MuJoCo's contact, soft and without restitution: judged on poses alone in this table, and at equal step below.
 
-{"Smoke run: much too short, nothing is judged. " if data["smoke"] else ""}{len(missed)} misses{": " + "; ".join(missed) if missed else "."}
+{verdict}
 
 ## Figures
 
 {common.table(["what", "unit", "bar", *methods], rows)}
 
-The stack's bar of drift is "stands"; momentum in float32 and float64 is bounded by rounding. d is the smallest half-size.
-Apexes of MuJoCo: solref of damping ratio {ZETA}, which bounces with e = 0.8 in the limit of a stiff contact.
+The stack's bar of drift is "stands"; momentum in float32 and float64 is bounded by rounding. d is the smallest
+half-size. Apexes of MuJoCo: solref of damping ratio {ZETA}, which bounces with e = 0.8 in the limit of a stiff contact.
 
 ## Apex heights [m], e = 0.8 from 1 m
 

@@ -33,7 +33,6 @@ if __name__ == "__main__":
         )
 
 import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
@@ -119,7 +118,7 @@ def _stack(n):
     return scene, worlds
 
 
-#: name: (maker, steps timed, batches of "fast", batch of "accurate", MuJoCo's worlds, bar of the ratio, bar of compile s)
+#: name: (maker, steps timed, batches of "fast", batch of "accurate", MuJoCo's worlds, bars of ratio and compile [s])
 SCENES = {
     "ball": (ball, 1000, (1024, 4096, 16384), 1024, 1024, 50.0, 5.0),
     "isotropic": (isotropic, 1000, (1024, 4096, 16384), 1024, 1024, 50.0, 5.0),
@@ -202,7 +201,8 @@ def measure(name, method, batches, args, env, steps, mj_worlds):
         ]
         ours, theirs = in_turn(calls, args.repeats)
         if errors is None:
-            errors = (contact_errors if scene.static else free_errors)(name, method, rival, program, model, one, size, worlds, args)
+            judge = contact_errors if scene.static else free_errors
+            errors = judge(name, rival, program, model, one, size, worlds, args)
         rate = size * steps / np.median(ours)
         mj_rate = mj_worlds * steps / np.median(theirs)
         status = np.asarray(program(model, state).status)
@@ -263,7 +263,7 @@ def _chained(program, model, state, seconds, steps):
     return state
 
 
-def contact_errors(name, method, rival, program, model, one, size, worlds, args):
+def contact_errors(name, rival, program, model, one, size, worlds, args):
     """After 2 s: deepest overlap and residual speed; then a slide (box) or a slip (ball) at the same step.
 
     "ours" and "mujoco" are the worst of 64 worlds. Distances and speeds are relative to the closed form.
@@ -306,7 +306,7 @@ def contact_errors(name, method, rival, program, model, one, size, worlds, args)
     return out
 
 
-def free_errors(name, method, rival, program, model, one, size, worlds, args):
+def free_errors(name, rival, program, model, one, size, worlds, args):
     """Attitude after 1 s against symtop4 at dt / 32 in float64 [rad], worst of 64 worlds."""
     few, fine = min(RUNS_OF_ERROR, size), 32
     steps = 250 if not args.smoke else 50
@@ -322,7 +322,8 @@ def free_errors(name, method, rival, program, model, one, size, worlds, args):
             scene, _ = SCENES[name][0]()
             m, s = rbd.build(scene, dt=DT / parts, method=rbd.Method("symtop4"))
             s = rbd.from_mujoco(m, p0, v0)
-            exact.append(np.asarray(jax.jit(lambda m, s, n=steps * parts: rbd.rollout(m, s, n, every=n)[0])(m, s).quat)[:, 0])
+            end = jax.jit(lambda m, s, n=steps * parts: rbd.rollout(m, s, n, every=n)[0])(m, s)
+            exact.append(np.asarray(end.quat)[:, 0])
     return {
         "seconds": steps * DT,
         "attitude_error_rad": {
@@ -348,6 +349,18 @@ def ten_boxes(method, env, size):
 
 
 # --- the page ---
+
+COLUMNS = (
+    "scene", "method", "batch", "ours [ns]", "IQR %", "MuJoCo [ns]", "IQR %", "ratio (range)", "bar", "",
+    "ratio, every step stored", "worlds with a status",
+)  # fmt: skip
+QUANTITIES = {
+    "penetration_m": "penetration [m]",
+    "residual_speed_m_s": "residual speed [m/s]",
+    "rolling_speed_error": "rolling speed, relative",
+    "slide_distance_error": "slide distance, relative",
+    "attitude_error_rad": "attitude [rad]",
+}
 
 
 def report(env, rows, extra, seconds):
@@ -385,9 +398,8 @@ def report(env, rows, extra, seconds):
         seen.add((r["scene"], r["method"]))
         for key, value in r["error"].items():
             if isinstance(value, dict):
-                errors.append(
-                    [TITLES[r["scene"]], r["method"], key.replace("_", " "), number(value["ours"]), number(value["mujoco"])]
-                )
+                what = [TITLES[r["scene"]], r["method"], QUANTITIES[key]]
+                errors.append([*what, number(value["ours"]), number(value["mujoco"])])
     ratios = [
         [TITLES[k], f"{v['batch']:,}"]
         + [f"{number(v[c])} {verdict(v[c], OVERHEAD_BAR)}" for c in ("vmap_over_rollout", "scan_over_rollout")]
@@ -398,10 +410,10 @@ def report(env, rows, extra, seconds):
 {common.header(env)}
 Made by `benchmarks/throughput.py` in {seconds:.0f} s; dt = 4 ms. Ours: float32, XLA's own threads, batch
 {"on one device" if env["sharded_over"] == 1 else f"sharded over {env['sharded_over']} host devices"}. MuJoCo: float64,
-`mujoco.rollout` with 2 threads, tuned chunks, arrays allocated before, compiling the model not counted. Both measured in
-turn, synchronised; median of {len(timed[0]["runs_s"]) if timed else 0}. World-steps per second of all cores together.
+`mujoco.rollout` with 2 threads, tuned chunks, arrays allocated before, compiling the model not counted. Both
+measured in turn, synchronised; median of {len(timed[0]["runs_s"]) if timed else 0}. World-steps per second of all cores together.
 
-{common.table(["scene", "method", "batch", "ours [ns]", "IQR %", "MuJoCo [ns]", "IQR %", "ratio (range)", "bar", "", "ratio, every step stored", "worlds with a status"], lines)}
+{common.table(COLUMNS, lines)}
 
 "ours" stores the final state only; MuJoCo's rollout always stores every step, "every step stored" is ours doing so too.
 Worlds of MuJoCo: {", ".join(f"{n} {SCENES[n][4]}" for n in SCENES)} (its rate does not depend on the number).
@@ -412,8 +424,8 @@ Worlds of MuJoCo: {", ".join(f"{n} {SCENES[n][4]}" for n in SCENES)} (its rate d
 
 ## Error at that speed
 
-Worst of {RUNS_OF_ERROR} worlds, at the same step. Contact scenes after 2 s: deepest overlap (MuJoCo's geometry measures both;
-MuJoCo with its default soft contact), residual speed (ball: along the normal only, since it rolls on). Then v0 = 1 to 4
+Worst of {RUNS_OF_ERROR} worlds, at the same step. Contact scenes after 2 s: deepest overlap (MuJoCo's geometry measures
+both; MuJoCo with its default soft contact), residual speed (ball: along the normal only, since it rolls on). Then v0 = 1 to 4
 m/s: slide to stop, or rolling speed over 5/7 v0. Free bodies: attitude after 1 s against symtop4 at dt/32, f64.
 
 {common.table(["scene", "method", "error", "ours", "MuJoCo"], errors)}
@@ -445,8 +457,8 @@ def main(args) -> int:
             ratio = f"{r['ratio']:8.2f} x MuJoCo" if "ratio" in r else ""
             speed = f"{r['ns_per_world_step']:9.1f} ns" if "ratio" in r else ""
             print(
-                f"{r['scene']:11s} {r['method']:9s} {r['batch']:6d} {speed} {ratio}  compile {r['compile_total_s']:.1f} s"
-                f"   ({time.perf_counter() - begin:.0f} s)",
+                f"{r['scene']:11s} {r['method']:9s} {r['batch']:6d} {speed} {ratio}"
+                f"  compile {r['compile_total_s']:.1f} s   ({time.perf_counter() - begin:.0f} s)",
                 flush=True,
             )
 
@@ -462,7 +474,7 @@ def main(args) -> int:
         if not args.smoke:
             keep(measure(name, "accurate", (accurate,), args, env, steps, mj_worlds))
         if name in ("ball", "box", "stack") and args.devices == 1:
-            extra[name] = overheads(name, args, steps, batches[0])
+            extra[name] = overheads(name, args, steps, min(batches[0], mj_worlds))
             new = [{**env, "benchmark": "overhead", "scene": name, "method": "fast", "dt": DT, **extra[name]}]
             common.append_lines(out / "throughput.jsonl", new)
     (out / "throughput.md").write_text(report(env, rows, extra, time.perf_counter() - begin), encoding="utf-8")

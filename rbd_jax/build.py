@@ -17,6 +17,7 @@ from .model import Group, Model, Structure, params
 from .scene import Scene, resolve, rotation
 from .shapes import SHAPES
 from .solvers.mujoco_law import MujocoLaw
+from .solvers.tgs import UNROLL
 from .spatial import Quat, Vec3
 from .state import Kinematic, Memory, State
 
@@ -240,9 +241,10 @@ def _groups(r, kinds, category, centred, method: Method, n: int) -> tuple[Group,
         else:
             ends = (body_a if k[3] else body_b)[:, None]
         order, colours = _colour(ends) if capacity is None else (np.arange(len(rows)), ())
+        order, colours, padding = _padded(order, colours, NARROW[kind].slots)
         groups.append(Group(
             kind, str(k[2]), bool(k[3]), ga[order], gb[order], body_a[order], body_b[order],
-            bool(k[4]), bool(k[5]), bool(k[6]), bool(k[7]), override[rows][order], rows[order], colours, capacity,
+            bool(k[4]), bool(k[5]), bool(k[6]), bool(k[7]), override[rows][order], rows[order], colours, capacity, padding,
         ))
     return tuple(groups)
 
@@ -273,6 +275,19 @@ def _colour(ends: np.ndarray) -> tuple[np.ndarray, tuple[tuple[int, int], ...]]:
     _, counts = np.unique(colour[order], return_counts=True)
     stops = np.cumsum(counts)
     return order, tuple((int(e - c), int(e)) for c, e in zip(counts, stops))
+
+
+def _padded(order: np.ndarray, colours, slots: int):
+    """Colours of one width for groups that loop over them: short ones repeat a pair, marked as padding (dead)."""
+    if slots <= UNROLL or len({e - s for s, e in colours}) <= 1:
+        return order, colours, None
+    width = max(e - s for s, e in colours)
+    rows, dead = [], []
+    for s, e in colours:
+        rows.append(np.concatenate([order[s:e], np.repeat(order[s], width - (e - s))]))
+        dead.append(np.arange(width) >= e - s)
+    k = len(colours)
+    return np.concatenate(rows), tuple((i * width, (i + 1) * width) for i in range(k)), np.concatenate(dead)
 
 
 def _mujoco_laws(r, groups, scene: Scene, dtype) -> tuple[MujocoLaw, ...]:

@@ -77,6 +77,8 @@ def _group(g: Group, gp: GroupParams, p: Params, world: World, number: int, reac
     m = NARROW[g.kind].function(pose_a, pose_b, size_a, size_b, margin, one=p.one)
     if pairs is not None:
         m = m._with(live=m.live & (pairs < len(g.a))[None])
+    if g.padding is not None:
+        m = m._with(live=m.live & ~g.padding[:, None])
     # the moving body of a one-body row is B, and the normal points to it
     flip = g.flip
     n = -m.normal if flip else m.normal

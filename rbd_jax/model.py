@@ -32,6 +32,7 @@ class Group:
     narrow phase points away from it. central_*: the geom is a sphere whose centre is the centre of
     mass. friction, restitution: whether any pair has them. capacity: None, or how many pairs are
     kept at run time. override: rows of the model's pair leaves, -1 = none. rows: rows of the resolved pairs.
+    padding: pairs that repeat another one to give the colours one width; their slots are dead.
     """
 
     kind: tuple[str, str]
@@ -49,6 +50,7 @@ class Group:
     rows: np.ndarray
     colours: tuple[tuple[int, int], ...] = ()
     capacity: int | None = None
+    padding: np.ndarray | None = None
 
     @property
     def moving(self) -> tuple[np.ndarray | None, np.ndarray]:

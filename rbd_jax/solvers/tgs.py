@@ -220,6 +220,8 @@ def _sweep(g: _Group, law: _Law, lam: Impulses, body, one):
         return _sweep_rolled(g, law, lam, body, one)
     colours = rows.colours or ((0, pairs),)
     whole = len(colours) == 1
+    if not whole and rows.slots > UNROLL:
+        return _sweep_colours(g, law, lam, body, one)
     pieces = []
     for start, stop in colours:
         def cut(x, axis):
@@ -230,14 +232,8 @@ def _sweep(g: _Group, law: _Law, lam: Impulses, body, one):
         b = Index(rows.b.rows[start:stop])
         a = Index(rows.a.rows[start:stop]) if rows.a is not None else None
         local = (take_tree(body, b), take_tree(body, a) if a is not None else None)
-        pair = _Group(
-            rows._with(
-                n=cut(rows.n, 0), rb=None, ra=None, phi=None, live=None, mu=cut(rows.mu, 0),
-                e=None, surface=None, feature=None, law=None, a=a, b=b,
-            ),
-            cut(g.t1, 0), cut(g.t2, 0), cut(g.inv_mass_b, 0), cut(g.inv_mass_a, 0),
-            cut(g.inertia_b, 0), cut(g.inertia_a, 0), None, None, None, None,
-        )
+        flat = (rows.n, rows.mu, g.t1, g.t2, g.inv_mass_b, g.inv_mass_a, g.inertia_b, g.inertia_a)
+        pair = _pair(rows, *cut(flat, 0), a, b)
         slots = cut((rows.rb, rows.ra, rows.surface, g.mass_n, g.mass_1, g.mass_2, law, lam), 1)
         local, new = _slots(pair, slots, local, one, unroll=rows.slots * len(colours) <= UNROLL)
         body = _write(body, b, local[0])
@@ -247,6 +243,53 @@ def _sweep(g: _Group, law: _Law, lam: Impulses, body, one):
     if whole:
         return body, pieces[0]
     return body, jax.tree.map(lambda *c: jnp.concatenate(c, axis=1), *pieces)
+
+
+def _sweep_colours(g: _Group, law: _Law, lam: Impulses, body, one):
+    """As ``_sweep``, the colours (all of one width) in a compiled loop: the program does not grow with them.
+
+    A colour may hold dead copies of a pair as padding; their change is exactly zero, so changes are added.
+    """
+    rows = g.rows
+    width = rows.colours[0][1] - rows.colours[0][0]
+    count = len(rows.colours)
+    table = lambda index: None if index is None else jnp.asarray(index.rows.reshape(count, width))
+    table_b, table_a = table(rows.b), table(rows.a)
+
+    def cut(x, axis, k):
+        same = lambda c: jnp.ndim(c) <= axis or c.shape[axis] == 1
+        part = lambda c: jax.lax.dynamic_slice_in_dim(c, k * width, width, axis=axis)
+        return jax.tree.map(lambda c: c if same(c) else part(c), x)
+
+    def colour(carry, k):
+        body, lam = carry
+        b = table_b[k]
+        a = None if table_a is None else table_a[k]
+        get = lambda i: jax.tree.map(lambda c: c[i], body)
+        old = (get(b), None if a is None else get(a))
+        flat = (rows.n, rows.mu, g.t1, g.t2, g.inv_mass_b, g.inv_mass_a, g.inertia_b, g.inertia_a)
+        n, mu, t1, t2, mb, ma, ib, ia = cut(flat, 0, k)
+        pair = _pair(rows, n, mu, t1, t2, mb, ma, ib, ia)
+        slots = cut((rows.rb, rows.ra, rows.surface, g.mass_n, g.mass_1, g.mass_2, law, lam), 1, k)
+        new, part = _slots(pair, slots, old, one, unroll=False)
+        add = lambda body, i, new, old: jax.tree.map(lambda c, p, q: c.at[i].add(p - q), body, new, old)
+        body = add(body, b, new[0], old[0])
+        if a is not None:
+            body = add(body, a, new[1], old[1])
+        put = lambda whole, part: jax.lax.dynamic_update_slice_in_dim(whole, part, k * width, axis=1)
+        return (body, jax.tree.map(put, lam, part)), None
+
+    lam = jax.tree.map(lambda c: jnp.broadcast_to(c, rows.phi.shape), lam)
+    (body, lam), _ = jax.lax.scan(colour, (body, lam), jnp.arange(count))
+    return body, lam
+
+
+def _pair(rows: Rows, n, mu, t1, t2, inv_mass_b, inv_mass_a, inertia_b, inertia_a, a=None, b=None) -> _Group:
+    """What ``_point`` needs of the pairs of one colour."""
+    bare = rows._with(
+        n=n, mu=mu, rb=None, ra=None, phi=None, live=None, e=None, surface=None, feature=None, law=None, a=a, b=b
+    )
+    return _Group(bare, t1, t2, inv_mass_b, inv_mass_a, inertia_b, inertia_a, None, None, None, None)
 
 
 def _write(body, index: Index, values):
@@ -365,11 +408,7 @@ def _sweep_rolled(g: _Group, law: _Law, lam: Impulses, body, one):
             tree, [next(xs) if r else c for r, c in zip(rolled, leaves)]
         )
         row = lambda x: jax.tree.map(lambda c: c[None], x)  # a pair axis of one
-        pair = _Group(
-            rows._with(n=row(n), rb=None, ra=None, phi=None, live=None, mu=row(mu), e=None, surface=None,
-                       feature=None, law=None, a=None, b=None),
-            row(t1), row(t2), row(mb), row(ma), row(ib), row(ia), None, None, None, None,
-        )
+        pair = _pair(rows, *row((n, mu, t1, t2, mb, ma, ib, ia)))
         get = lambda i: jax.tree.map(lambda c: c[i, column][None], body)
         local = (get(b), get(a) if a is not None else None)
         slot = jax.tree.map(lambda c: c if jnp.ndim(c) == 0 else c[:, None], slot)
