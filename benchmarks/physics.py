@@ -410,8 +410,8 @@ def report(data):
 
 {common.header(data["environment"])}
 Made by `benchmarks/physics.py` in {data["seconds"]:.0f} s. Float32, 1/240 s unless said. MuJoCo: itself at a
-tenth of the step with its default contact (float64, elliptic cone, Newton); it is shown, not judged. The "mujoco" preset
-has MuJoCo's contact, soft and without restitution: judged on poses alone in this table, and at equal step below.
+tenth of the step with its default contact (float64, elliptic cone, Newton); it is shown, not judged. The "mujoco"
+preset has MuJoCo's contact, soft and without restitution: judged on poses alone in this table, and at equal step below.
 
 {verdict}
 
@@ -419,8 +419,10 @@ has MuJoCo's contact, soft and without restitution: judged on poses alone in thi
 
 {common.table(["what", "unit", "bar", *methods], rows)}
 
-The stack's bar of drift is "stands"; momentum in float32 and float64 is bounded by rounding. d is the smallest
-half-size. Apexes of MuJoCo: solref of damping ratio {ZETA}, which bounces with e = 0.8 in the limit of a stiff contact.
+The bars of drift (0.02 m: it stands) and of momentum (rounding) are this script's own; those of poses are 1 mm;
+the others are the issue's. MuJoCo's contact is soft: its stack sinks by the figure above, and a rigid one differs
+by that. d is the smallest half-size. Apexes of MuJoCo: solref of damping ratio {ZETA},
+which bounces with e = 0.8 in the limit of a stiff contact.
 
 ## Apex heights [m], e = 0.8 from 1 m
 

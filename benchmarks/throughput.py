@@ -411,7 +411,8 @@ def report(env, rows, extra, seconds):
 Made by `benchmarks/throughput.py` in {seconds:.0f} s; dt = 4 ms. Ours: float32, XLA's own threads, batch
 {"on one device" if env["sharded_over"] == 1 else f"sharded over {env['sharded_over']} host devices"}. MuJoCo: float64,
 `mujoco.rollout` with 2 threads, tuned chunks, arrays allocated before, compiling the model not counted. Both
-measured in turn, synchronised; median of {len(timed[0]["runs_s"]) if timed else 0}. World-steps per second of all cores together.
+measured in turn, synchronised; median of {len(timed[0]["runs_s"]) if timed else 0}. ns per world-step of all cores
+together.
 
 {common.table(COLUMNS, lines)}
 
@@ -425,8 +426,8 @@ Worlds of MuJoCo: {", ".join(f"{n} {SCENES[n][4]}" for n in SCENES)} (its rate d
 ## Error at that speed
 
 Worst of {RUNS_OF_ERROR} worlds, at the same step. Contact scenes after 2 s: deepest overlap (MuJoCo's geometry measures
-both; MuJoCo with its default soft contact), residual speed (ball: along the normal only, since it rolls on). Then v0 = 1 to 4
-m/s: slide to stop, or rolling speed over 5/7 v0. Free bodies: attitude after 1 s against symtop4 at dt/32, f64.
+both; MuJoCo with its default soft contact), residual speed (ball: along the normal only, since it rolls on). Then v0 =
+1 to 4 m/s: slide to stop, or rolling speed over 5/7 v0. Free bodies: attitude after 1 s against symtop4 at dt/32, f64.
 
 {common.table(["scene", "method", "error", "ours", "MuJoCo"], errors)}
 
