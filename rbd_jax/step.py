@@ -191,6 +191,8 @@ def _substep(model: Model, p: Params, world: World, wrench: Wrench | None) -> Wo
     v, L = integrator.kick(old, a, tau, p.inertia, p.h)
     problem = _problem(p, old, v, L, contacts)
     solution = model.method.solver.solve(problem)
+    if any(rows.e is not None and rows.slots > 1 for rows in problem.rows):
+        solution = _passive(p, problem, solution)
     v1 = v + solution.impulse * p.inv_mass
     L1 = L if solution.angular_impulse is None else L + solution.angular_impulse
     v1, L1 = materialise((v1, L1), p.one)
@@ -399,6 +401,70 @@ def _impacts(p: Params, problem: Problem, solution: Solution, v1: Vec3) -> _Impa
             couple = late.cross(take_tree(v1, rows.b) - take_tree(v1, rows.a)) * 0.5
             balance = both(balance, couple, couple * -1.0)
     return _Impacts(impulse, shift * p.inv_mass, turn, balance, tuple(left))
+
+
+def _passive(p: Params, problem: Problem, solution: Solution) -> Solution:
+    """Contact impulses scaled down where an impact would add energy.
+
+    Newton's restitution law with friction at several points of a body can (Kane 1985). With u-, u+ the
+    relative velocities just before and after the impulses p (at their own instant; a resting contact acts
+    over the whole step, so at its middle), theta p do the work theta (p.u- + theta p.(u+ - u-) / 2). A single
+    frictionless impact has p.u+ = -e p.u-; theta is the largest value in 0..1 that gives no more than that,
+    with e = 1 for resting contacts: one a body where bodies touch fixed geometry only, else one a world.
+    """
+    accel = (problem.v - problem.v0) / p.h
+    v = problem.v + solution.impulse * p.inv_mass
+    w = None
+    if problem.w is not None:
+        w = problem.w + problem.inv_inertia @ solution.angular_impulse
+    coupled = any(rows.a is not None for rows in problem.rows)
+    before = after = most = jnp.zeros_like(problem.v.x)
+    for rows, lam in zip(problem.rows, solution.contacts):
+        left, e = 0.5 * p.h, 1.0
+        if rows.e is not None:
+            events = targets(rows, problem)
+            left, e = (jnp.where(events.active, x, y) for x, y in ((events.left, left), (rows.e, e)))
+        b, a = (_power(rows, lam, v_, w_, accel, left) for v_, w_ in ((problem.v, problem.w), (v, w)))
+        slots = lambda c: c.sum(axis=0)
+        before, after = add_rows(before, rows.b, slots(b)), add_rows(after, rows.b, slots(a))
+        most = add_rows(most, rows.b, slots(-e * b))
+    if coupled:
+        before, after, most = (c.sum(axis=0, keepdims=True) for c in (before, after, most))
+    gains = after > most
+    change = jnp.where(gains, after - before, 1.0)
+    theta = jnp.where(gains, jnp.clip((most - before) / jnp.where(change > 0, change, 1.0), 0.0, 1.0), 1.0)
+    theta = materialise(theta, p.one)
+    scaled = lambda v, base: None if v is None else base + (v - base) * theta
+    rate = lambda rows: theta if coupled else take(theta, rows.b)
+    return solution._with(
+        impulse=solution.impulse * theta,
+        angular_impulse=None if w is None else solution.angular_impulse * theta,
+        contacts=tuple(
+            jax.tree.map(lambda c, rows=rows: c * rate(rows), lam)
+            for rows, lam in zip(problem.rows, solution.contacts)
+        ),
+        v_move=scaled(solution.v_move, problem.v),
+        w_move=scaled(solution.w_move, problem.w),
+    )
+
+
+def _power(rows: Rows, lam: Impulses, v: Vec3, w: Vec3 | None, accel: Vec3, left) -> jax.Array:
+    """p . u of every slot, (S, P, B) [J], u being ``left`` [s] before the end of the step."""
+    p = rows.n * lam.n
+    if lam.t1 is not None:
+        t1, t2 = rows.tangents
+        p = p + t1 * lam.t1 + t2 * lam.t2
+
+    def side(index, arm):
+        u = take_tree(v, index) - take_tree(accel, index) * left
+        return u if w is None else u + take_tree(w, index).cross(arm)
+
+    u = side(rows.b, rows.rb)
+    if rows.a is not None:
+        u = u - side(rows.a, rows.ra)
+    if rows.surface is not None:
+        u = u - rows.surface
+    return p.dot(u)
 
 
 def _spread_sides(total: Vec3, rows, b: Vec3, a: Vec3 | None) -> Vec3:
