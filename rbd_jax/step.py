@@ -195,7 +195,8 @@ def _substep(model: Model, p: Params, world: World, wrench: Wrench | None) -> Wo
         solution = _passive(p, problem, solution)
     v1 = v + solution.impulse * p.inv_mass
     L1 = L if solution.angular_impulse is None else L + solution.angular_impulse
-    v1, L1 = materialise((v1, L1), p.one)
+    if solution.warm:
+        v1, L1 = materialise((v1, L1), p.one)
     v_move = v1 if solution.v_move is None else solution.v_move
     L_move = L1
     if solution.w_move is not None:
