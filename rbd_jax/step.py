@@ -335,7 +335,8 @@ def _correction(p: Params, problem: Problem, solution: Solution, v0: Vec3, v1: V
     push = zeros_like(v0)
     for rows, lam in zip(problem.rows, solution.contacts):
         push = _spread(push, rows, rows.n * lam.n.sum(axis=0))
-    push = materialise(push, p.one)
+    if solution.warm:
+        push = materialise(push, p.one)
     s = push.dot(push)
     touched = s > 0
     d = (v0 - v1) * (0.5 * p.h)
