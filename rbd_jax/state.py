@@ -40,7 +40,7 @@ class Kinematic:
 class Memory:
     """What a method carries from step to step; every part may be None.
 
-    L: angular momentum the last step ended with, leaves (..., n): the exact value behind omega.
+    L: angular momentum the last step ended with, leaves (..., n): the exact value behind omega (anisotropic bodies).
     R: rotation matrix, for integrators that carry one.
     contacts: impulses of the last step per group, leaves (..., S, P); a normal impulse that was an impact is
       stored negative, as the next step must not start from it. feature: their codes (..., P);
@@ -100,8 +100,8 @@ class State:
     def replace(self, **changes) -> State:
         """Return a copy with ``pos``, ``vel``, ``quat``, ``omega``, ``kinematic_*``, ``step``, ``status`` changed.
 
-        Arrays have the shape of what they replace. A new ``quat`` keeps omega, a new attitude or
-        omega drops the memory of the angular momentum. Quaternions are used as given: normalise them.
+        Arrays have the shape of what they replace, or broadcast to it. Quaternions are normalised. A new ``quat`` keeps
+        omega; a new attitude or omega drops the memory of the angular momentum.
 
         Raises:
           ValueError: unknown field or wrong shape.
@@ -114,7 +114,8 @@ class State:
             if short is not None:
                 owner = self._prescribed() if prescribed else self
                 old = getattr(owner, short)
-                (moved if prescribed else new)[short] = _split(name, value, old)
+                value = _split(name, value, old)
+                (moved if prescribed else new)[short] = value.normalised() if short == "q" else value
             elif name in ("step", "status", "memory", "dt"):
                 new[name] = value
             else:
@@ -126,7 +127,7 @@ class State:
             if memory.L is not None:
                 memory = memory._with(L=memory.L.map(lambda c: jnp.full_like(c, jnp.nan)))
             if memory.R is not None and "quat" in changes:
-                memory = memory._with(R=(new["q"].normalised()).mat())
+                memory = memory._with(R=None)
             new["memory"] = memory
         return self._with(**new)
 

@@ -46,29 +46,16 @@ def with_memory(model: Model, state: State) -> State:
         contacts.append(Impulses(lam, lam, lam) if g.friction else Impulses(lam))
         feature.append(jnp.full((*batch, shape[1]), -1, jnp.int32) if g.features else None)
         pairs.append(jnp.full((*batch, shape[1]), len(g.a), jnp.int32) if g.capacity else None)
-    L = R = None
-    if s.attitude:
+    L = None
+    if s.attitude and not s.isotropic:
         nan = jnp.full_like(state.x.x, jnp.nan)
         L = Vec3(nan, nan, nan)
-        if model.method.integrator.carries_matrix:
-            R = _principal_attitude(model, state).mat()
-    return state._with(memory=Memory(L, R, tuple(contacts), tuple(feature), tuple(pairs)))
-
-
-def _principal_attitude(model: Model, state: State) -> Quat:
-    """Attitude of the principal frames, in the public layout."""
-    batch = state.batch_shape
-    p = params(model, batch, jnp.ones(()))
-    q = to_hot(state.q, batch).normalised()
-    if p.principal is not None:
-        q = q @ p.principal
-    return to_public(jax.tree.map(lambda c: jnp.broadcast_to(c, (state.n, max(1, c.shape[-1]))), q), batch)
+    return state._with(memory=Memory(L, None, tuple(contacts), tuple(feature), tuple(pairs)))
 
 
 @jax.custom_jvp
 def _exactly(computed, remembered):
     """``remembered`` where it agrees with ``computed`` to rounding; derivatives are those of ``computed``."""
-    near = jnp.zeros((), bool)
     eps = 16 * jnp.finfo(computed.x.dtype).eps
     d = computed - remembered
     near = d.dot(d) <= eps * eps * computed.dot(computed)
@@ -91,12 +78,16 @@ def enter(model: Model, state: State, batch: tuple[int, ...]) -> tuple[Params, W
     hot = to_hot(state, batch)
     memory = hot.memory
     if s.attitude:
-        q = hot.q.normalised()
-        if p.principal is not None:
-            q = q @ p.principal
+        q = hot.q if p.principal is None else hot.q @ p.principal
+        if memory.L is not None:  # else I omega would differ from L by more than rounding after many single steps
+            q = q.normalised()
         L = p.inertia.momentum(q, hot.w)
-        L = _exactly(L, memory.L)
-        bodies = Bodies(hot.x, hot.v, q, L, memory.R)
+        if memory.L is not None:
+            L = _exactly(L, memory.L)
+        R = memory.R
+        if R is None and model.method.integrator.carries_matrix:
+            R = q.mat()
+        bodies = Bodies(hot.x, hot.v, q, L, R)
         quat = spin = None
     else:
         bodies = Bodies(hot.x, hot.v)
@@ -113,11 +104,21 @@ def leave(model: Model, p: Params, world: World, batch: tuple[int, ...] | None, 
         quat, spin = world.quat, world.spin
     else:
         quat = bodies.q if p.principal is None else bodies.q @ p.principal.conj()
-        spin = p.inertia.velocity(bodies.q, bodies.L)
+        spin = _angular_velocity(p, bodies)
     dt = jnp.broadcast_to(p.h * model.method.substeps, world.step.shape)
-    kept = Memory(bodies.L, bodies.R, world.contacts, world.feature, world.pairs) if memory else None
+    L = None if model.structure.isotropic else bodies.L
+    kept = Memory(L, bodies.R, world.contacts, world.feature, world.pairs) if memory else None
     hot = State(bodies.x, bodies.v, quat, spin, world.step, world.status, dt, world.kinematic, kept)
     return hot if batch is None else to_public(hot, batch)
+
+
+def _angular_velocity(p: Params, bodies: Bodies) -> Vec3:
+    """omega of the state. For isotropic bodies (L / I) I is L again to the bit, if the division is a true one:
+    by an array of L's own shape, as XLA multiplies with the reciprocal of a broadcast one.
+    """
+    if p.inertia.isotropic:
+        return bodies.L.map(lambda c: c / (p.inertia.moments + 0.0 * c))
+    return p.inertia.velocity(bodies.q, bodies.L)
 
 
 # --- forces ---
