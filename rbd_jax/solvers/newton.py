@@ -66,7 +66,7 @@ class NewtonLagged(Solver):
     slip_speed: float = 1e-4
     slip_compliance: float = 1e-3
     push_speed: float = 3.0
-    tolerance: float = 1e-2
+    tolerance: float = 5e-2
 
     name = "newton_lagged"
     contact = "near_rigid"
