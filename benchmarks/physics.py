@@ -77,9 +77,7 @@ def box(e=None):
 
 
 def stack(n=5, half=0.1):
-    bodies = [
-        rbd.Body(f"box{i}", rbd.Box((half,) * 3), pos=(0, 0, half * (2 * i + 1)), friction=0.6) for i in range(n)
-    ]
+    bodies = [rbd.Body(f"box{i}", rbd.Box((half,) * 3), pos=(0, 0, half * (2 * i + 1)), friction=0.6) for i in range(n)]
     return rbd.Scene(bodies=bodies, static=[rbd.Geom(rbd.Plane(), friction=0.6)], dt=DT)
 
 

@@ -103,8 +103,7 @@ def box():
 def _stack(n):
     half = 0.1
     bodies = [
-        rbd.Body(f"box{i}", rbd.Box((half, half, half)), pos=(0, 0, half * (2 * i + 1)), friction=0.6)
-        for i in range(n)
+        rbd.Body(f"box{i}", rbd.Box((half, half, half)), pos=(0, 0, half * (2 * i + 1)), friction=0.6) for i in range(n)
     ]
     scene = _scene(bodies, friction=0.6)
 

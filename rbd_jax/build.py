@@ -7,19 +7,18 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from .contact import NARROW
 from .method import Method, find
-from .model import Group, Model, Structure, params
+from .model import Group, Model, Structure
 from .scene import Scene, resolve, rotation
 from .shapes import SHAPES
 from .solvers.mujoco_law import MujocoLaw
 from .solvers.tgs import UNROLL
 from .spatial import Quat, Vec3
-from .state import Kinematic, Memory, State
+from .state import Kinematic, State
 
 #: Groups with more pairs than this choose their pairs at run time (a box pair costs far more than a ball pair).
 DENSE_PAIRS = {("box", "box"): 100, ("sphere", "box"): 600, ("sphere", "sphere"): 2100}
@@ -196,7 +195,7 @@ def _quat_of(R: np.ndarray) -> np.ndarray:
 
 
 def _needs_attitude(r, groups, kinds, category, centred) -> bool:
-    """Attitude is carried unless every body is made of centred spheres, without friction and without a mentioned spin."""
+    """Attitude is carried unless all bodies are centred spheres, without friction and without a mentioned spin."""
     moving = category == "dynamic"
     plain = (kinds[moving] == "sphere").all() and centred[moving].all()
     if not moving.any():
@@ -230,7 +229,10 @@ def _groups(r, kinds, category, centred, method: Method, n: int) -> tuple[Group,
         rows = np.array([i for i, other in enumerate(key) if other == k])
         kind = (str(k[0]), str(k[1]))
         if kind not in NARROW:
-            raise ValueError(f"no narrow phase for the pair {kind[0]}-{kind[1]} ({r.geom_names[a[rows[0]]]}, {r.geom_names[b[rows[0]]]})")
+            raise ValueError(
+                f"no narrow phase for the pair {kind[0]}-{kind[1]} "
+                f"({r.geom_names[a[rows[0]]]}, {r.geom_names[b[rows[0]]]})"
+            )
         ga, gb = a[rows], b[rows]
         body_a, body_b = r.geom_body[ga], r.geom_body[gb]
         capacity = None
@@ -242,10 +244,26 @@ def _groups(r, kinds, category, centred, method: Method, n: int) -> tuple[Group,
             ends = (body_a if k[3] else body_b)[:, None]
         order, colours = _colour(ends) if capacity is None else (np.arange(len(rows)), ())
         order, colours, padding = _padded(order, colours, NARROW[kind].slots)
-        groups.append(Group(
-            kind, str(k[2]), bool(k[3]), ga[order], gb[order], body_a[order], body_b[order],
-            bool(k[4]), bool(k[5]), bool(k[6]), bool(k[7]), override[rows][order], rows[order], colours, capacity, padding,
-        ))
+        groups.append(
+            Group(
+                kind,
+                str(k[2]),
+                bool(k[3]),
+                ga[order],
+                gb[order],
+                body_a[order],
+                body_b[order],
+                bool(k[4]),
+                bool(k[5]),
+                bool(k[6]),
+                bool(k[7]),
+                override[rows][order],
+                rows[order],
+                colours,
+                capacity,
+                padding,
+            )
+        )
     return tuple(groups)
 
 
@@ -311,17 +329,26 @@ def _mujoco_laws(r, groups, scene: Scene, dtype) -> tuple[MujocoLaw, ...]:
 
 def _start(model: Model, r, dtype) -> State:
     n = len(r.mass)
-    part = lambda a: tuple(jnp.asarray(np.ascontiguousarray(np.asarray(a, float)[:, k]), dtype) for k in range(a.shape[1]))
+    part = lambda a: tuple(
+        jnp.asarray(np.ascontiguousarray(np.asarray(a, float)[:, k]), dtype) for k in range(a.shape[1])
+    )
     com = np.stack([p + rotation(q) @ c for p, q, c in zip(r.pos, r.quat, r.com)]) if n else np.zeros((0, 3))
     kinematic = None
     if len(r.kinematic_names):
         kinematic = Kinematic(
-            Vec3(*part(r.kinematic_pos)), Quat(*part(r.kinematic_quat)),
-            Vec3(*part(r.kinematic_vel)), Vec3(*part(r.kinematic_omega)),
+            Vec3(*part(r.kinematic_pos)),
+            Quat(*part(r.kinematic_quat)),
+            Vec3(*part(r.kinematic_vel)),
+            Vec3(*part(r.kinematic_omega)),
         )
     state = State(
-        Vec3(*part(com)), Vec3(*part(r.vel)), Quat(*part(r.quat)), Vec3(*part(r.omega)),
-        step=jnp.zeros((), jnp.int32), status=jnp.zeros((), jnp.uint32), dt=jnp.asarray(model.dt, dtype),
+        Vec3(*part(com)),
+        Vec3(*part(r.vel)),
+        Quat(*part(r.quat)),
+        Vec3(*part(r.omega)),
+        step=jnp.zeros((), jnp.int32),
+        status=jnp.zeros((), jnp.uint32),
+        dt=jnp.asarray(model.dt, dtype),
         kinematic=kinematic,
     )
     from .step import with_memory

@@ -123,8 +123,12 @@ def _parser() -> argparse.ArgumentParser:
 
     def add(name, command, summary, example):
         sub = commands.add_parser(
-            name, help=summary, description=summary[0].upper() + summary[1:] + ".", epilog=example,
-            formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False,
+            name,
+            help=summary,
+            description=summary[0].upper() + summary[1:] + ".",
+            epilog=example,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
         )
         sub.set_defaults(command=command, prog=sub.prog)
         return sub
@@ -137,14 +141,19 @@ def _parser() -> argparse.ArgumentParser:
 
     def add_noise(sub):
         sub.add_argument(
-            "--perturb", type=_number(">= 0", "m, m/s"), default=0.0, metavar="SIZE",
+            "--perturb",
+            type=_number(">= 0", "m, m/s"),
+            default=0.0,
+            metavar="SIZE",
             help="add Gaussian noise of this standard deviation to the start positions [m] and velocities [m/s] of "
             "every world",
         )
         sub.add_argument("--seed", type=_integer(0), default=0, metavar="N", help="of the noise (default 0)")
 
     sub = add(
-        "run", _run, "simulate a scene and write the trajectory, a page that plays it, or a picture",
+        "run",
+        _run,
+        "simulate a scene and write the trajectory, a page that plays it, or a picture",
         "examples:\n"
         "  rbd-jax run box_stack --html out.html --png shot.png\n"
         "  rbd-jax run scene.xml --batch 64 --perturb 0.01 --seconds 10 --method fast --out out.npz\n\n"
@@ -159,7 +168,9 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--batch", type=_integer(1), default=1, metavar="B", help="number of worlds (default 1)")
     add_noise(sub)
     sub.add_argument(
-        "--every", type=_integer(1), metavar="K",
+        "--every",
+        type=_integer(1),
+        metavar="K",
         help=f"steps between two samples (default: about {SAMPLE_RATE:g} samples per simulated second)",
     )
     sub.add_argument("--out", metavar="FILE.npz", help="write the trajectory of all worlds")
@@ -171,7 +182,9 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--quiet", action="store_true", help="print nothing but warnings and errors")
 
     sub = add(
-        "validate", _validate, "compare a scene with MuJoCo: a table, and exit code 1 if out of tolerance",
+        "validate",
+        _validate,
+        "compare a scene with MuJoCo: a table, and exit code 1 if out of tolerance",
         "example:\n  rbd-jax validate bouncing_balls --method mujoco",
     )
     add_scene(sub, method=None, dt=False)
@@ -179,7 +192,9 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--json", action="store_true", help="print the report as JSON")
 
     sub = add(
-        "bench", _bench, "measure compile time, speed and penetration, beside MuJoCo on all threads",
+        "bench",
+        _bench,
+        "measure compile time, speed and penetration, beside MuJoCo on all threads",
         "example:\n  rbd-jax bench box_stack --batch 1,64,1024 --method fast --append results.jsonl\n\n"
         "MuJoCo runs the same scene at the same step through mujoco.rollout; its rate does not depend on the batch.",
     )

@@ -14,10 +14,9 @@ from .contact.base import Manifold, Pose
 from .contact.broadphase import compact, half_widths, lookup, separation
 from .model import Group, GroupParams, Params, Structure
 from .solvers.rows import Impulses, Index, Rows, take, take_tree
-from .spatial import Vec3, safe_norm, where
+from .spatial import safe_norm
 from .state import World
 from .struct import struct
-from .xla import materialise
 
 #: Slots up to this part of a box's size above the surface count as contact points of the manifold.
 SLOP = 0.02
@@ -63,9 +62,7 @@ def _group(g: Group, gp: GroupParams, p: Params, world: World, number: int, reac
         pairs, overflow = _choose(g, gp, world, reach)
         chosen = jnp.minimum(pairs, len(g.a) - 1)
         body_a, body_b = (jnp.asarray(rows)[chosen] for rows in (np.maximum(g.body_a, 0), np.maximum(g.body_b, 0)))
-        local_a, local_b, size_a, size_b, mu, e, law = take_tree(
-            (local_a, local_b, size_a, size_b, mu, e, law), chosen
-        )
+        local_a, local_b, size_a, size_b, mu, e, law = take_tree((local_a, local_b, size_a, size_b, mu, e, law), chosen)
     pose_a = _pose(world, _side(g, "a"), body_a, local_a)
     pose_b = _pose(world, _side(g, "b"), body_b, local_b)
     margin = jnp.inf if model_of_contact == "soft" else 0.0
@@ -73,7 +70,9 @@ def _group(g: Group, gp: GroupParams, p: Params, world: World, number: int, reac
         margin = law.margin
     if model_of_contact == "near_rigid":
         near = SLOP * min_size(g.kind, size_a, size_b)
-        margin = near + sum(take(reach, i) for c, i in ((_side(g, "a"), body_a), (_side(g, "b"), body_b)) if c == "dynamic")
+        margin = near + sum(
+            take(reach, i) for c, i in ((_side(g, "a"), body_a), (_side(g, "b"), body_b)) if c == "dynamic"
+        )
     m = NARROW[g.kind].function(pose_a, pose_b, size_a, size_b, margin, one=p.one)
     if pairs is not None:
         m = m._with(live=m.live & (pairs < len(g.a))[None])
@@ -161,9 +160,7 @@ def _last(g: Group, world: World, number: int, pairs, feature) -> Impulses:
         place = lookup(pairs, world.pairs[number], len(g.a))
         known = place < pairs.shape[0]
         safe = jnp.where(known, place, 0)
-        last = jax.tree.map(
-            lambda c: jnp.where(known[None], jnp.take_along_axis(c, safe[None], axis=1), 0.0), last
-        )
+        last = jax.tree.map(lambda c: jnp.where(known[None], jnp.take_along_axis(c, safe[None], axis=1), 0.0), last)
         if feature is not None:
             same = jnp.take_along_axis(world.feature[number], safe, axis=0) == feature
             last = jax.tree.map(lambda c: jnp.where(same[None], c, 0.0), last)

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from .detect import detect
-from .model import Model, batch_of, params
-from .spatial import Mat3, Vec3, components, pack, vec3
+from .model import Model, batch_of
+from .spatial import Vec3, pack
 from .state import State, Wrench, to_public
-from .status import MESSAGE, Status
+from .status import MESSAGE
 from .step import enter, with_memory
 from .struct import struct
 
@@ -125,8 +125,16 @@ def contacts(model: Model, state: State) -> Contacts:
     public = to_public(joined, batch)
     body_a, body_b, geom_a, geom_b, point, normal, distance, force, kind, live = public
     return Contacts(
-        ints(body_a), ints(body_b), ints(geom_a), ints(geom_b), pack(point), pack(normal), distance, pack(force),
-        ints(kind), live,
+        ints(body_a),
+        ints(body_b),
+        ints(geom_a),
+        ints(geom_b),
+        pack(point),
+        pack(normal),
+        distance,
+        pack(force),
+        ints(kind),
+        live,
     )
 
 
@@ -152,13 +160,23 @@ def _points(model, g, gp, c, lam, p, b, w):
         least = least.min()
     live = rows.live & ((rows.phi <= 1e-3 * least) | (lam.n > 0))
     kind = jnp.where(live, jnp.where(u < -slow, 2, jnp.where(u > slow, 3, 1)), 0)
-    index = lambda rows_: jnp.asarray(rows_)[:, None] if c.pairs is None else jnp.asarray(rows_)[jnp.minimum(c.pairs, len(rows_) - 1)]
+    index = lambda rows_: (
+        jnp.asarray(rows_)[:, None] if c.pairs is None else jnp.asarray(rows_)[jnp.minimum(c.pairs, len(rows_) - 1)]
+    )
     moving = lambda side: g.category == "dynamic" or (side == "a") == g.flip
     body = lambda side, rows_: index(rows_ if moving(side) else np.full(len(rows_), -1))
     vec = lambda v: v.map(flat)
     return (
-        flat(body("a", g.body_a)), flat(body("b", g.body_b)), flat(index(g.a)), flat(index(g.b)),
-        vec(c.manifold.point), vec(c.manifold.normal), flat(rows.phi), vec(force), flat(kind), flat(live),
+        flat(body("a", g.body_a)),
+        flat(body("b", g.body_b)),
+        flat(index(g.a)),
+        flat(index(g.b)),
+        vec(c.manifold.point),
+        vec(c.manifold.normal),
+        flat(rows.phi),
+        vec(force),
+        flat(kind),
+        flat(live),
     )
 
 

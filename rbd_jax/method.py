@@ -51,9 +51,7 @@ class Method:
             raise ValueError(f"Method: solver = {solver!r} must be a name or a Solver")
         contact = self.contact or solver.contact
         if contact != solver.contact:
-            raise ValueError(
-                f"Method: solver '{solver.name}' speaks contact model '{solver.contact}', not '{contact}'"
-            )
+            raise ValueError(f"Method: solver '{solver.name}' speaks contact model '{solver.contact}', not '{contact}'")
         for field in ("substeps", "capacity"):
             value = getattr(self, field)
             if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):

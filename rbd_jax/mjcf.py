@@ -849,10 +849,7 @@ def _write_contact(root, r, custom):
         )  # fmt: skip
     plain = Pair("a", "b")
     custom.text["rbd_pairs"] = json.dumps(
-        [
-            {k: v for k, v in vars(p).items() if k in ("a", "b") or v != getattr(plain, k)}
-            for p in scene.pairs
-        ]
+        [{k: v for k, v in vars(p).items() if k in ("a", "b") or v != getattr(plain, k)} for p in scene.pairs]
     )
 
 

@@ -18,8 +18,7 @@ from .bodies import Inertia
 from .contact import NARROW
 from .contact.base import Pose
 from .method import Method
-from .solvers.rows import Index
-from .spatial import Quat, Vec3, quat, vec3
+from .spatial import Quat, Vec3
 from .struct import static, struct
 
 
@@ -74,7 +73,9 @@ class Structure:
 
     def __init__(self, **fields):
         self.__dict__.update(fields)
-        self._digest = hashlib.sha1(repr(sorted((k, _plain(v)) for k, v in fields.items() if k != "names")).encode()).digest()
+        self._digest = hashlib.sha1(
+            repr(sorted((k, _plain(v)) for k, v in fields.items() if k != "names")).encode()
+        ).digest()
 
     def __hash__(self):
         return hash(self._digest)
@@ -97,9 +98,22 @@ jax.tree_util.register_static(Structure)
 
 #: Axes of every leaf without batch axes.
 BASE_NDIM = dict(
-    dt=0, gravity=1, drag=1, mass=1, friction=1, restitution=1, radius=1, half_extents=2,
-    geom_pos=2, geom_quat=2, static_pos=2, static_quat=2, pair_friction=1, pair_restitution=1,
-    com=2, principal=2,
+    dt=0,
+    gravity=1,
+    drag=1,
+    mass=1,
+    friction=1,
+    restitution=1,
+    radius=1,
+    half_extents=2,
+    geom_pos=2,
+    geom_quat=2,
+    static_pos=2,
+    static_quat=2,
+    pair_friction=1,
+    pair_restitution=1,
+    com=2,
+    principal=2,
 )
 
 
@@ -191,10 +205,15 @@ class Model:
 
 def _check_number(name: str, value: np.ndarray) -> None:
     rules = {
-        "dt": (value > 0, "> 0 [s]"), "mass": (value > 0, "> 0 [kg]"), "inertia": (value > 0, "> 0 [kg m^2]"),
-        "radius": (value > 0, "> 0 [m]"), "half_extents": (value > 0, "> 0 [m]"),
-        "friction": (value >= 0, ">= 0"), "restitution": ((value >= 0) & (value <= 1), "in 0..1"),
-        "pair_friction": (value >= 0, ">= 0"), "pair_restitution": ((value >= 0) & (value <= 1), "in 0..1"),
+        "dt": (value > 0, "> 0 [s]"),
+        "mass": (value > 0, "> 0 [kg]"),
+        "inertia": (value > 0, "> 0 [kg m^2]"),
+        "radius": (value > 0, "> 0 [m]"),
+        "half_extents": (value > 0, "> 0 [m]"),
+        "friction": (value >= 0, ">= 0"),
+        "restitution": ((value >= 0) & (value <= 1), "in 0..1"),
+        "pair_friction": (value >= 0, ">= 0"),
+        "pair_restitution": ((value >= 0) & (value <= 1), "in 0..1"),
     }
     ok, rule = rules.get(name, (np.ones_like(value, bool), "finite"))
     bad = ~(ok & np.isfinite(value))
@@ -319,8 +338,12 @@ def _reordered(values, axes: np.ndarray):
 #: Attitude of a frame whose x, y, z lie along these axes of the body, up to sign (odd orders turn -x).
 _H = np.sqrt(0.5)
 TURNS = {
-    (0, 1, 2): (1.0, 0.0, 0.0, 0.0), (1, 2, 0): (0.5, 0.5, 0.5, 0.5), (2, 0, 1): (0.5, -0.5, -0.5, -0.5),
-    (1, 0, 2): (_H, 0.0, 0.0, -_H), (0, 2, 1): (0.0, 0.0, -_H, -_H), (2, 1, 0): (_H, 0.0, _H, 0.0),
+    (0, 1, 2): (1.0, 0.0, 0.0, 0.0),
+    (1, 2, 0): (0.5, 0.5, 0.5, 0.5),
+    (2, 0, 1): (0.5, -0.5, -0.5, -0.5),
+    (1, 0, 2): (_H, 0.0, 0.0, -_H),
+    (0, 2, 1): (0.0, 0.0, -_H, -_H),
+    (2, 1, 0): (_H, 0.0, _H, 0.0),
 }
 
 
@@ -390,6 +413,11 @@ def _group_params(model: Model, g: Group, number: int, get, batch) -> GroupParam
     if model.laws is not None:
         law = jax.tree.map(lambda c: c[..., None], model.laws[number])
     return GroupParams(
-        size_a, size_b, local_a, local_b,
-        combined("friction", g.friction), combined("restitution", g.restitution), law,
+        size_a,
+        size_b,
+        local_a,
+        local_b,
+        combined("friction", g.friction),
+        combined("restitution", g.restitution),
+        law,
     )

@@ -15,7 +15,6 @@ from __future__ import annotations
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from .build import build
@@ -168,7 +167,13 @@ def _open_loop(mujoco, mj, data, scene, model, start, method, qpos, qvel, dt) ->
     _, traj = rollout(model, start, steps)
     rows = [
         Row("3 open loop", "MuJoCo started 1e-7 apart", own, None, ""),
-        Row("3 open loop", "mujoco preset", _relative(to_mujoco(model, traj)[0], qpos), max(EXACT, SENSITIVITY * own), ""),
+        Row(
+            "3 open loop",
+            "mujoco preset",
+            _relative(to_mujoco(model, traj)[0], qpos),
+            max(EXACT, SENSITIVITY * own),
+            "",
+        ),
     ]
     if method != "mujoco":
         model, start = build(scene, method=method)

@@ -16,7 +16,7 @@ import numpy as np
 
 from .model import BASE_NDIM, Model, batch_of
 from .spatial import Vec3
-from .state import State, World, Wrench, to_public
+from .state import State, World, Wrench
 from .step import advance, enter, leave, with_memory
 
 

@@ -131,8 +131,13 @@ class Body:
         who = f"body '{self.name}'"
         put = _setter(self)
         many = [self.geoms] if isinstance(self.geoms, (Shape, Geom)) else _items(self.geoms, f"{who}: geoms")
-        put("geoms", tuple(check_geom(g, f"{who}, {_geom_label(g, i)}" if len(many) > 1 or _name_of(g) else who)
-                           for i, g in enumerate(many)))
+        put(
+            "geoms",
+            tuple(
+                check_geom(g, f"{who}, {_geom_label(g, i)}" if len(many) > 1 or _name_of(g) else who)
+                for i, g in enumerate(many)
+            ),
+        )
         put("pos", _vector(self.pos, 3, who, "pos", "[m]"))
         put("quat", _unit(self.quat, who))
         put("vel", None if self.vel is None else _vector(self.vel, 3, who, "vel", "[m/s]"))

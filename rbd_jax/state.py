@@ -119,7 +119,9 @@ class State:
             elif name in ("step", "status", "memory", "dt"):
                 new[name] = value
             else:
-                raise ValueError(f"State has no field '{name}'; fields: pos, vel, quat, omega, kinematic_*, step, status")
+                raise ValueError(
+                    f"State has no field '{name}'; fields: pos, vel, quat, omega, kinematic_*, step, status"
+                )
         if moved:
             new["kinematic"] = self.kinematic._with(**moved)
         if ("quat" in changes or "omega" in changes) and self.memory is not None and "memory" not in changes:

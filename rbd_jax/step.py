@@ -16,11 +16,11 @@ import jax.numpy as jnp
 
 from .bodies import Bodies
 from .detect import detect
-from .model import Model, Params, Structure, batch_of, params
+from .model import Model, Params, params
 from .solvers.base import Problem, Solution
 from .solvers.restitution import normal_velocity, targets
 from .solvers.rows import Impulses, InverseInertia, Rows, add_rows, take, take_tree
-from .spatial import Quat, Vec3, components, qexp, where, zeros_like
+from .spatial import Vec3, components, qexp, where, zeros_like
 from .state import Kinematic, Memory, State, World, Wrench, to_hot, to_public
 from .status import Status
 from .struct import struct
@@ -266,9 +266,7 @@ def _remember(world: World, bodies: Bodies, p: Params, contacts, solution: Solut
         bodies=bodies,
         kinematic=_prescribed(p, world.kinematic),
         contacts=tuple(shape(c, w) for c, w in zip(lasting, world.contacts)),
-        feature=tuple(
-            None if w is None else shape(c.rows.feature, w) for c, w in zip(contacts, world.feature)
-        ),
+        feature=tuple(None if w is None else shape(c.rows.feature, w) for c, w in zip(contacts, world.feature)),
         pairs=tuple(c.pairs for c in contacts),
         status=status,
     )
@@ -443,8 +441,7 @@ def _passive(p: Params, problem: Problem, solution: Solution) -> Solution:
         impulse=solution.impulse * theta,
         angular_impulse=None if w is None else solution.angular_impulse * theta,
         contacts=tuple(
-            jax.tree.map(lambda c, rows=rows: c * rate(rows), lam)
-            for rows, lam in zip(problem.rows, solution.contacts)
+            jax.tree.map(lambda c, rows=rows: c * rate(rows), lam) for rows, lam in zip(problem.rows, solution.contacts)
         ),
         v_move=scaled(solution.v_move, problem.v),
         w_move=scaled(solution.w_move, problem.w),

@@ -7,7 +7,6 @@ adding a feature to the package must not grow a scene that does not use it.
 import jax
 import numpy as np
 import pytest
-import scenes
 
 import rbd_jax as rbd
 from rbd_jax.rollout import _rollout_batch
@@ -66,7 +65,8 @@ REDUCED = {
     "free cube": (rbd.Scene([body(CUBE)], gravity=None), 160),
     "asymmetric free body": (rbd.Scene([body(BRICK)], gravity=None), 360),
     "frictionless sphere on a plane": (
-        rbd.Scene([body(SPHERE, friction=None)], static=[rbd.Geom(rbd.Plane(), friction=None)]), 290,
+        rbd.Scene([body(SPHERE, friction=None)], static=[rbd.Geom(rbd.Plane(), friction=None)]),
+        290,
     ),
     "sphere on a plane": (rbd.Scene([body(SPHERE)], static=[rbd.Plane()]), 530),
     "bouncing sphere on a plane": (rbd.Scene([body(SPHERE, restitution=0.8)], static=[rbd.Plane()]), 800),
@@ -101,7 +101,8 @@ def test_isotropic_body_needs_one_exponential_and_no_trigonometry_elsewhere():
 def test_bodies_on_static_ground_are_not_coupled():
     """Many spheres on a plane: the program is that of one, with no gather and no scatter."""
     many = rbd.Scene(
-        [rbd.Body(f"b{i}", SPHERE, pos=(i, 0, 1), friction=1.0, **_apart(i)) for i in range(5)], static=[rbd.Plane()],
+        [rbd.Body(f"b{i}", SPHERE, pos=(i, 0, 1), friction=1.0, **_apart(i)) for i in range(5)],
+        static=[rbd.Plane()],
         pairs=[rbd.Pair(f"b{i}", f"b{j}", exclude=True) for i in range(5) for j in range(i)],
     )
     one = REDUCED["sphere on a plane"][0]

@@ -124,7 +124,9 @@ def test_friction_combines_by_the_larger_value_and_pairs_override():
     def slide(body, plane, pairs=()):
         scene = rbd.Scene(
             bodies=[rbd.Body("box", rbd.Box((0.1, 0.1, 0.1)), pos=(0, 0, 0.1), vel=(2.0, 0, 0), friction=body)],
-            static=[rbd.Geom(rbd.Plane(), friction=plane, name="floor")], pairs=pairs, dt=1 / 240,
+            static=[rbd.Geom(rbd.Plane(), friction=plane, name="floor")],
+            pairs=pairs,
+            dt=1 / 240,
         )
         return float(run(scene, 3.0, "fast", every=720)[1].pos[0, 0])
 
@@ -138,7 +140,10 @@ def test_friction_combines_by_the_larger_value_and_pairs_override():
 def test_masked_and_excluded_geoms_pass_through_each_other():
     for kwargs, pairs in (({"mask": 0, "group": 0}, ()), ({}, [rbd.Pair("ball", "static:0", exclude=True)])):
         scene = rbd.Scene(
-            [rbd.Body("ball", rbd.Geom(rbd.Sphere(0.1), **kwargs), pos=(0, 0, 0.2))], static=[rbd.Plane()], pairs=pairs, dt=1 / 240
+            [rbd.Body("ball", rbd.Geom(rbd.Sphere(0.1), **kwargs), pos=(0, 0, 0.2))],
+            static=[rbd.Plane()],
+            pairs=pairs,
+            dt=1 / 240,
         )
         model, final, _ = run(scene, 1.0, "fast", every=240)
         assert not model.structure.groups
@@ -149,8 +154,11 @@ def test_masked_and_excluded_geoms_pass_through_each_other():
 def test_restitution_at_several_corners_never_adds_energy(method):
     """Newton's law alone added half the energy scale m g d in single steps of a tumbling box with e = 0.9."""
     scene = rbd.Scene(
-        bodies=[rbd.Body("b", rbd.Box((0.1, 0.15, 0.2)), pos=(0, 0, 0.6), omega=(1, 2, 3), restitution=0.9, friction=0.5)],
-        static=[scenes.ground(friction=0.5)], dt=1 / 240,
+        bodies=[
+            rbd.Body("b", rbd.Box((0.1, 0.15, 0.2)), pos=(0, 0, 0.6), omega=(1, 2, 3), restitution=0.9, friction=0.5)
+        ],
+        static=[scenes.ground(friction=0.5)],
+        dt=1 / 240,
     )
     model, state = rbd.build(scene, method=method)
     rng = np.random.RandomState(1)

@@ -26,9 +26,7 @@ MATRIX = [
     )
 ]
 ALL = [(name, {}) for name in INTEGRATORS] + MATRIX
-every = pytest.mark.parametrize(
-    "name, options", ALL, ids=[n + "".join(f"-{v}" for v in o.values()) for n, o in ALL]
-)
+every = pytest.mark.parametrize("name, options", ALL, ids=[n + "".join(f"-{v}" for v in o.values()) for n, o in ALL])
 
 
 @pytest.fixture(autouse=True)
@@ -42,9 +40,7 @@ def bodies(omega, moments=BOX, v=(0.0, 0.0, 0.0), q=None, dtype=float):
     omega = np.atleast_2d(omega)
     count = len(omega)
     moments = np.asarray(moments, float)
-    leaf = lambda a: Vec3(
-        *(jnp.asarray(c, dtype)[None, :] for c in np.broadcast_to(a, (count, 3)).T)
-    )
+    leaf = lambda a: Vec3(*(jnp.asarray(c, dtype)[None, :] for c in np.broadcast_to(a, (count, 3)).T))
     q = np.tile([1.0, 0, 0, 0], (count, 1)) if q is None else np.atleast_2d(q)
     q = Quat(*(jnp.asarray(c, dtype)[None, :] for c in q.T))
     if moments.ndim:
@@ -103,10 +99,7 @@ def test_order_of_attitude(name, options):
     steps, duration = {1: (4000, 1.0), 2: (200, 2.0), 4: (30, 2.0)}[order]
     b, inertia = bodies(SPIN)
     exact = EulerTop(BOX, SPIN).matrix(duration)
-    coarse, fine = (
-        angle(run(name, b, inertia, duration / n, n, **options).q, exact)
-        for n in (steps, 2 * steps)
-    )
+    coarse, fine = (angle(run(name, b, inertia, duration / n, n, **options).q, exact) for n in (steps, 2 * steps))
     assert abs(np.log2(coarse / fine) - order) < 0.15, (coarse, fine)
 
 
@@ -267,9 +260,7 @@ def test_agrees_with_mujoco(name):
     mujoco = pytest.importorskip("mujoco")
     rng = np.random.default_rng(3)
     h, n = 0.002, 1000
-    kind = {"mujoco_euler": "Euler", "mujoco_implicitfast": "implicitfast", "mujoco_rk4": "RK4"}[
-        name
-    ]
+    kind = {"mujoco_euler": "Euler", "mujoco_implicitfast": "implicitfast", "mujoco_rk4": "RK4"}[name]
     for turned_by_torque in (False, True):
         for _ in range(3):
             sides = rng.uniform(0.1, 0.5, 3)

@@ -40,9 +40,12 @@ def test_a_hundred_bodies_and_a_hundred_static_geoms():
     scene = rbd.Scene(
         bodies=[
             rbd.Body(f"b{i}_{j}", rbd.Box((0.1, 0.1, 0.1)), pos=(0.25 * i, 0.25 * j, 0.13), friction=0.6)
-            for i in range(n) for j in range(n)
+            for i in range(n)
+            for j in range(n)
         ],
-        static=[rbd.Geom(rbd.Box((0.05, 0.05, 0.02)), pos=(0.25 * i, 0.25 * j, 0.01)) for i in range(n) for j in range(n)],
+        static=[
+            rbd.Geom(rbd.Box((0.05, 0.05, 0.02)), pos=(0.25 * i, 0.25 * j, 0.01)) for i in range(n) for j in range(n)
+        ],
         dt=1 / 240,
     )
     model, state = rbd.build(scene, method="fast")

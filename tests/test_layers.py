@@ -7,14 +7,41 @@ import rbd_jax
 
 ROOT = pathlib.Path(rbd_jax.__file__).parent
 LAYER = {
-    "struct": 0, "status": 0, "spatial": 1, "xla": 1, "bodies": 2, "shapes": 2, "scene": 3, "state": 3, "mjcf": 4,
-    "integrators": 4, "contact": 4, "solvers": 5, "method": 6, "model": 6, "detect": 7, "step": 7, "build": 7,
-    "rollout": 8, "diagnostics": 8, "convert": 8, "parity": 9, "record": 9, "view": 9, "cli": 10, "examples": 3,
+    "struct": 0,
+    "status": 0,
+    "spatial": 1,
+    "xla": 1,
+    "bodies": 2,
+    "shapes": 2,
+    "scene": 3,
+    "state": 3,
+    "mjcf": 4,
+    "integrators": 4,
+    "contact": 4,
+    "solvers": 5,
+    "method": 6,
+    "model": 6,
+    "detect": 7,
+    "step": 7,
+    "build": 7,
+    "rollout": 8,
+    "diagnostics": 8,
+    "convert": 8,
+    "parity": 9,
+    "record": 9,
+    "view": 9,
+    "cli": 10,
+    "examples": 3,
 }
 #: Inside one layer: who may import whom.
 WITHIN = {
-    ("model", "method"), ("step", "detect"), ("build", "step"), ("record", "view"), ("mjcf", "examples"),
-    ("diagnostics", "rollout"), ("parity", "record"),
+    ("model", "method"),
+    ("step", "detect"),
+    ("build", "step"),
+    ("record", "view"),
+    ("mjcf", "examples"),
+    ("diagnostics", "rollout"),
+    ("parity", "record"),
 }
 
 

@@ -31,10 +31,13 @@ FLOOR = '<geom name="floor" type="plane" size="0 0 1"/>'
 def random_scene(seed):
     """Compound bodies, turned inertias, offsets, all fields."""
     rng = np.random.default_rng(seed)
+
     def number():
         return float(rng.normal() * 10.0 ** rng.integers(-2, 3))
+
     def vec(n=3):
         return tuple(number() for _ in range(n))
+
     def pick(*options):
         return options[rng.integers(len(options))]
 
@@ -191,12 +194,13 @@ def test_pairs_and_their_numbers_are_those_of_mujocos_contacts(seed):
     """All geoms in one place: each pair that may touch does."""
     rng = np.random.default_rng(seed)
     scene = random_scene(seed)
+
     def put(g, shape=Sphere(1.0)):
-        return dataclasses.replace(
-            g, pos=tuple(rng.normal(size=3) * 1e-2), shape=shape, margin=0.01
-        )
+        return dataclasses.replace(g, pos=tuple(rng.normal(size=3) * 1e-2), shape=shape, margin=0.01)
+
     def put_body(b):
         return dataclasses.replace(b, pos=(0, 0, 0), geoms=[put(g) for g in b.geoms], com=None)
+
     scene = dataclasses.replace(
         scene,
         bodies=[put_body(b) for b in scene.bodies],
@@ -268,8 +272,10 @@ def test_keyframes():
         'mpos="7 0 0" mquat="0 1 0 0"/></keyframe>'
     )
     xml = mjcf(BALL + '<body name="m" mocap="true" pos="1 0 0"><geom size="1"/></body>', keys)
+
     def at(key):
         return load_mjcf(xml, keyframe=key)
+
     assert at(None).bodies[0].pos == (0, 0, 1) == at("low").bodies[0].pos == at(0).bodies[0].pos
     assert at("high").bodies[0].pos == (0, 0, 9) == at(1).bodies[0].pos and at(1).bodies[0].vel == (0, 0, 5)
     assert at(1).kinematic[0].pos == (7, 0, 0) and at(1).kinematic[0].quat == (0, 1, 0, 0)
@@ -430,8 +436,10 @@ def test_zeros_are_absent_unless_kept():
 
 def test_restitution():
     xml = mjcf(BALL + FLOOR, '<custom><numeric name="rbd_restitution:ball" data="0.4"/></custom>')
+
     def restitutions(s):
         return (s.bodies[0].geoms[0].restitution, s.static[0].restitution)
+
     assert restitutions(load_mjcf(xml)) == (0.4, None)
     assert restitutions(load_mjcf(xml, restitution=0.8)) == (0.8, 0.8)
     with pytest.raises(ValueError, match="restitution = 1.5 must be between 0 and 1"):
@@ -587,6 +595,7 @@ def test_examples_load_without_warning_and_round_trip(name):
 def test_examples_hold_what_they_say():
     def load(name):
         return load_mjcf(examples.path(name))
+
     assert [b.geoms[0].restitution for b in load("bouncing_balls").bodies] == [0.4, 0.8, 0.95]
     stack = load("box_stack")
     assert len(stack.bodies) == 5 and stack.dt == 1 / 240 and stack.bodies[0].geoms[0].friction == 0.6

@@ -4,12 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mujoco_pairs import GeomLaw, PairLaw, combine, law_of_pairs
 
 from rbd_jax.bodies import Inertia
 from rbd_jax.solvers import dense
 from rbd_jax.solvers.base import Problem
 from rbd_jax.solvers.mujoco import MujocoNewton
-from rbd_jax.solvers.mujoco_law import GeomLaw, PairLaw, combine, law_of_pairs
 from rbd_jax.solvers.newton import NewtonLagged
 from rbd_jax.solvers.rows import Impulses, Index, InverseInertia, Rows
 from rbd_jax.spatial import Quat, Vec3, qexp, tangent_basis
@@ -55,8 +55,13 @@ def plane_rows(x, q, half, mu, margin=0.01, index=None, **more):
     phi = x.z + arms.z
     shape, dtype = phi.shape[1:], phi.dtype
     return Rows(
-        n=filled((0, 0, 1), shape, dtype), rb=arms, phi=phi, live=phi < margin,
-        b=Index(np.arange(shape[0])) if index is None else index, mu=mu, **more,
+        n=filled((0, 0, 1), shape, dtype),
+        rb=arms,
+        phi=phi,
+        live=phi < margin,
+        b=Index(np.arange(shape[0])) if index is None else index,
+        mu=mu,
+        **more,
     )
 
 
@@ -75,8 +80,14 @@ def stack_rows(x, q, half, mu, margin=0.01):
     clip = lambda c, limit: jnp.clip(c, -limit, limit)
     point = ql.rotate(Vec3(clip(local.x, hl.x), clip(local.y, hl.y), local.z))
     return Rows(
-        n=normal, ra=point, rb=point + low(x) - up(x), phi=phi, live=phi < margin,
-        a=Index(np.arange(n - 1)), b=Index(np.arange(1, n)), mu=mu,
+        n=normal,
+        ra=point,
+        rb=point + low(x) - up(x),
+        phi=phi,
+        live=phi < margin,
+        a=Index(np.arange(n - 1)),
+        b=Index(np.arange(1, n)),
+        mu=mu,
     )
 
 
@@ -98,8 +109,18 @@ def make_problem(rows, state, mass, inertia, h, warm=None, force=None, gyro=True
     ws = w + (inv @ L.cross(w)) * h if gyro else w
     acc = filled((0, 0, -GRAVITY), v.x.shape, dtype) if force is None else force
     return Problem(
-        rows=tuple(rows), v0=v, v=v + acc * h, w0=w, w=ws, inv_mass=1.0 / mass, h=h, q=q, inertia=inertia,
-        inv_inertia=inv, warm=tuple(no_warm(r) for r in rows) if warm is None else warm, one=jnp.ones((), dtype),
+        rows=tuple(rows),
+        v0=v,
+        v=v + acc * h,
+        w0=w,
+        w=ws,
+        inv_mass=1.0 / mass,
+        h=h,
+        q=q,
+        inertia=inertia,
+        inv_inertia=inv,
+        warm=tuple(no_warm(r) for r in rows) if warm is None else warm,
+        one=jnp.ones((), dtype),
     )
 
 
@@ -347,8 +368,15 @@ def spheres(rng, worlds, mu=0.4, e=None, slots=1):
     phi = (x.z - radius)[None]
     arm = filled((0, 0, -radius), phi.shape, phi.dtype)
     rows = Rows(
-        n=filled((0, 0, 1), (1, worlds), phi.dtype), rb=arm, phi=phi, live=phi < 0.01, b=Index([0]),
-        mu=None if mu is None else jnp.full((1, 1), mu), e=e, central_b=True, law=plane_law(),
+        n=filled((0, 0, 1), (1, worlds), phi.dtype),
+        rb=arm,
+        phi=phi,
+        live=phi < 0.01,
+        b=Index([0]),
+        mu=None if mu is None else jnp.full((1, 1), mu),
+        e=e,
+        central_b=True,
+        law=plane_law(),
     )
     if slots == 2:
         two = lambda c: jnp.concatenate([c, c])
@@ -529,25 +557,25 @@ def random_scene(rng, touch=True):
     def law():
         s = f'friction="{u(0.1, 1.2):.3f} 0 0" condim="{rng.choice([1, 3, 3])}" solmix="{u(0.2, 3):.3f}" '
         s += f'priority="{rng.choice([0, 0, 0, 1])}" '
-        s += f'solimp="{u(.6, .9):.3f} {u(.9, .99):.3f} {u(.002, .05):.4f} {u(.2, .8):.2f} {u(1, 3):.2f}" '
+        s += f'solimp="{u(0.6, 0.9):.3f} {u(0.9, 0.99):.3f} {u(0.002, 0.05):.4f} {u(0.2, 0.8):.2f} {u(1, 3):.2f}" '
         if rng.random() < 0.3:
             return s + f'solref="{-u(500, 3000):.1f} {-u(20, 80):.1f}" '
-        return s + f'solref="{u(.002, .05):.4f} {u(.3, 1.5):.2f}" margin="{u(0, .01):.4f}" gap="{u(0, .005):.4f}" '
+        return s + f'solref="{u(0.002, 0.05):.4f} {u(0.3, 1.5):.2f}" margin="{u(0, 0.01):.4f}" gap="{u(0, 0.005):.4f}" '
 
     bodies = ""
     for k in range(4):
         q = rng.normal(size=4)
         if rng.random() < 0.5:
-            shape = f'type="sphere" size="{u(.1, .2):.3f}"'
+            shape = f'type="sphere" size="{u(0.1, 0.2):.3f}"'
         else:
-            shape = f'type="box" size="{u(.1, .2):.3f} {u(.1, .2):.3f} {u(.1, .2):.3f}"'
+            shape = f'type="box" size="{u(0.1, 0.2):.3f} {u(0.1, 0.2):.3f} {u(0.1, 0.2):.3f}"'
             if rng.random() < 0.5:
                 q = np.array([1, 0, 0, 0]) + 1e-2 * q
         away, up = (0.0, 0.2 * k) if touch else (0.4 * k, 0.0)
-        pos = f"{u(-.15, .15) + away:.3f} {u(-.15, .15):.3f} {u(.1, .15) + up:.3f}"
+        pos = f"{u(-0.15, 0.15) + away:.3f} {u(-0.15, 0.15):.3f} {u(0.1, 0.15) + up:.3f}"
         bodies += f'<body pos="{pos}" quat="{" ".join(map(str, q))}"><freejoint/>'
         bodies += f'<geom {shape} mass="{10 ** u(-1, 2):.4f}" conaffinity="{int(touch)}" {law()}/></body>'
-    option = OPTION.format(f'impratio="{10 ** u(0, 1.5):.3f}" timestep="{u(.001, .01):.4f}"')
+    option = OPTION.format(f'impratio="{10 ** u(0, 1.5):.3f}" timestep="{u(0.001, 0.01):.4f}"')
     return (
         f'<mujoco>{option}<worldbody><geom type="plane" size="5 5 1" {law()}/>'
         f'<geom type="box" size=".1 .1 .1" pos=".3 0 .05" {law()}/>{bodies}</worldbody></mujoco>'
@@ -556,8 +584,13 @@ def random_scene(rng, touch=True):
 
 def geom_law(m, g):
     return GeomLaw(
-        friction=m.geom_friction[g, 0], solref=tuple(m.geom_solref[g]), solimp=tuple(m.geom_solimp[g]),
-        margin=m.geom_margin[g], gap=m.geom_gap[g], solmix=m.geom_solmix[g], priority=int(m.geom_priority[g]),
+        friction=m.geom_friction[g, 0],
+        solref=tuple(m.geom_solref[g]),
+        solimp=tuple(m.geom_solimp[g]),
+        margin=m.geom_margin[g],
+        gap=m.geom_gap[g],
+        solmix=m.geom_solmix[g],
+        priority=int(m.geom_priority[g]),
         condim=int(m.geom_condim[g]),
     )
 
@@ -597,13 +630,19 @@ def mujoco_problem(m, d, pairs=(12, 24), dtype=jnp.float64):
         law = jax.tree.map(lambda x: jnp.asarray(x, dtype), law_of_pairs(laws, impratio=m.opt.impratio))
         law = law._with(frictional=jnp.asarray([[p.condim == 3] for p in laws]))
         slot = lambda v: jax.tree.map(lambda leaf: leaf[None], arr(v))
-        rows.append(Rows(
-            n=arr(normal), phi=jnp.asarray(fill([c.dist for c in cs], 0.0), dtype)[None, :, None],
-            live=jnp.asarray(np.arange(size) < len(items))[None, :, None], law=law,
-            rb=slot(pos - d.xipos[b + 1]), b=jnp.asarray(b)[:, None],
-            ra=slot(pos - d.xipos[a + 1]) if dynamic else None, a=jnp.asarray(a)[:, None] if dynamic else None,
-            mu=jnp.asarray([[p.friction] for p in laws], dtype),
-        ))
+        rows.append(
+            Rows(
+                n=arr(normal),
+                phi=jnp.asarray(fill([c.dist for c in cs], 0.0), dtype)[None, :, None],
+                live=jnp.asarray(np.arange(size) < len(items))[None, :, None],
+                law=law,
+                rb=slot(pos - d.xipos[b + 1]),
+                b=jnp.asarray(b)[:, None],
+                ra=slot(pos - d.xipos[a + 1]) if dynamic else None,
+                a=jnp.asarray(a)[:, None] if dynamic else None,
+                mu=jnp.asarray([[p.friction] for p in laws], dtype),
+            )
+        )
     state = (arr(d.xipos[1:]), q, arr(vel), arr(omega))
     mass = jnp.asarray(m.body_mass[1:, None], dtype)
     problem = make_problem(rows, state, mass, Inertia(arr(m.body_inertia[1:])), np.array([m.opt.timestep]))
@@ -727,8 +766,14 @@ def test_mujoco_bouncing_sphere():
         phi = (state[0].z - 0.1)[None]
         z = jnp.zeros_like(phi)
         rows = Rows(
-            n=filled((0, 0, 1), (1, 1), phi.dtype), rb=Vec3(z, z, -0.1 - 0.5 * phi), phi=phi, live=phi < 0,
-            b=Index([0]), mu=jnp.full((1, 1), 0.4), law=law, central_b=True,
+            n=filled((0, 0, 1), (1, 1), phi.dtype),
+            rb=Vec3(z, z, -0.1 - 0.5 * phi),
+            phi=phi,
+            live=phi < 0,
+            b=Index([0]),
+            mu=jnp.full((1, 1), 0.4),
+            law=law,
+            central_b=True,
         )
         problem = make_problem([rows], state, mass, inertia, m.opt.timestep, warm)
         s = solver.solve(problem)

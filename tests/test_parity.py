@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scenes
 
 import rbd_jax as rbd
 from rbd_jax.examples import path
@@ -23,11 +22,15 @@ def wild(**kwargs):
             rbd.Body(
                 "hammer",
                 [rbd.Geom(rbd.Box((0.05, 0.05, 0.2))), rbd.Geom(rbd.Box((0.15, 0.06, 0.05)), pos=(0, 0, 0.25))],
-                pos=(0.1, 0.2, 1.0), quat=(0.9, 0.1, -0.3, 0.2), vel=(1, 0, 0.5), omega=(1, 2, 3),
+                pos=(0.1, 0.2, 1.0),
+                quat=(0.9, 0.1, -0.3, 0.2),
+                vel=(1, 0, 0.5),
+                omega=(1, 2, 3),
             ),
             rbd.Body("ball", rbd.Sphere(0.1), pos=(1, 0, 1), vel=(0, 1, 0), omega=(3, 0, 1)),
         ],
-        dt=0.002, **kwargs,
+        dt=0.002,
+        **kwargs,
     )
 
 
@@ -62,7 +65,8 @@ def test_free_flight_is_mujoco_to_1e10(integrator):
             rbd.Body("a", rbd.Box((0.1, 0.2, 0.3)), omega=(1, 2, 3), vel=(1, 0, 2)),
             rbd.Body("b", rbd.Box((0.3, 0.1, 0.2)), pos=(2, 0, 0), quat=(0.5, 0.5, -0.5, 0.5), omega=(0.1, 1, 0)),
         ],
-        dt=0.002, integrator=integrator,
+        dt=0.002,
+        integrator=integrator,
     )
     with jax.enable_x64(True):
         mj, data = compile_mujoco(scene)

@@ -154,6 +154,7 @@ def test_quaternions_are_normalised_and_unit_ones_kept():
 def test_scene_is_a_value():
     def make():
         return Scene([Body("b", [Sphere(1), Geom(Box((1, 2, 3)))], pos=np.ones(3))], static=Plane())
+
     assert make() == make() and hash(make()) == hash(make())
     assert dataclasses.replace(make(), dt=0.1).dt == 0.1
     assert repr(UNSET) == "UNSET"
@@ -264,10 +265,7 @@ def test_masks_follow_contype_and_conaffinity():
     kinds = [(1, 1), (2, 1), (4, 2), (0, 0), (1, 0), (0, 1), (-1, 0)]
     bodies = [Body(f"b{i}", Geom(Sphere(1), group=g, mask=m)) for i, (g, m) in enumerate(kinds)]
     expect = [
-        [i, j]
-        for i, (g, m) in enumerate(kinds)
-        for j, (h, n) in enumerate(kinds)
-        if i < j and ((g & n) or (h & m))
+        [i, j] for i, (g, m) in enumerate(kinds) for j, (h, n) in enumerate(kinds) if i < j and ((g & n) or (h & m))
     ]
     assert resolve(Scene(bodies)).pairs.tolist() == expect
 
@@ -284,8 +282,10 @@ def _one(*pairs, a=None, b=None):
 def test_combination_by_the_larger_value():
     def f(mu, e=None, **kw):
         return Geom(Sphere(1), friction=mu, restitution=e, **kw)
+
     def g(mu, e=None, **kw):
         return Geom(Plane(), friction=mu, restitution=e, name="floor", **kw)
+
     assert _one(a=f(0.2, 0.5), b=g(0.3, 0.1)) == (0.3, 0.5)
     assert _one(a=f(None), b=g(None)) == (None, None)
     assert _one(a=f(None), b=g(0.3, 0.0)) == (0.3, 0.0)
@@ -308,8 +308,10 @@ def test_overrides():
 
 def test_exclusion_and_precedence():
     two = [Sphere(1), Sphere(1)]
+
     def make(*pairs):
         return resolve(Scene([Body("a", two), Body("b", two)], static=[Geom(Plane(), name="f")], pairs=pairs))
+
     assert len(make().pairs) == 4 + 4
     assert len(make(Pair("a", "b", exclude=True)).pairs) == 4
     assert len(make(Pair("a:0", "b", exclude=True)).pairs) == 6

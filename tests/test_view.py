@@ -194,9 +194,7 @@ def decode_page(page):
     arrays = {}
     for name, a in head["arrays"].items():
         count = int(np.prod(a["shape"]))
-        arrays[name] = np.frombuffer(raw, "<" + np.dtype(a["type"]).str[1:], count, a["offset"]).reshape(
-            a["shape"]
-        )
+        arrays[name] = np.frombuffer(raw, "<" + np.dtype(a["type"]).str[1:], count, a["offset"]).reshape(a["shape"])
     for name in ("pos", "quat"):
         arrays[name] = np.cumsum(arrays[name], -1, dtype=np.int16).astype(float)
     mid, step = (arrays[k].astype(float)[..., None] for k in ("pos_mid", "pos_step"))
@@ -233,9 +231,7 @@ def test_page_is_self_contained_and_escapes(tmp_path):
 
 def test_geoms_that_differ_between_worlds(tmp_path):
     size = [(0.1,), (0.2,), (0.3,)]
-    clip = Clip(
-        [{**sphere(0), "size": size}], [0.0], np.zeros((3, 1, 1, 3)), np.tile([1.0, 0, 0, 0], (3, 1, 1, 1))
-    )
+    clip = Clip([{**sphere(0), "size": size}], [0.0], np.zeros((3, 1, 1, 3)), np.tile([1.0, 0, 0, 0], (3, 1, 1, 1)))
     write_html(clip, tmp_path / "a.html")
     _, arrays, _, _ = decode_page((tmp_path / "a.html").read_text("utf-8"))
     assert np.allclose(arrays["geom_size"][:, 0, 0], [0.1, 0.2, 0.3])

@@ -27,8 +27,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..spatial import Vec3, components, where
-from .base import Manifold, Pose
 from ..xla import materialise
+from .base import Manifold, Pose
 
 SLOTS = 12
 # An edge axis within acos(0.99) = 8 degrees of the face normal must win by 5 %, any edge axis by 1e-6.

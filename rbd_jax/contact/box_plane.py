@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..spatial import Vec3
-from .base import Manifold, Pose
 from ..xla import materialise
+from .base import Manifold, Pose
 
 # Corner k of the box has sign + along axis i where bit i of k is set; shape (8, 1, 1) each.
 CORNERS = tuple(((np.arange(8)[:, None, None] >> axis) & 1) * 2.0 - 1.0 for axis in range(3))

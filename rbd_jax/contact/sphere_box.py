@@ -5,8 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from ..shapes import Box
-from .base import Manifold, Pose
 from ..xla import materialise
+from .base import Manifold, Pose
 
 
 def sphere_box(a: Pose, b: Pose, size_a, size_b, margin, one=1.0) -> Manifold:

@@ -41,9 +41,7 @@ class Euler(Integrator):
         if self.attitude not in ("matrix", "quaternion"):
             raise ValueError(f'attitude must be "matrix" or "quaternion", not {self.attitude!r}')
         if self.orthonormalise not in ORTHONORMALISE:
-            raise ValueError(
-                f"orthonormalise must be one of {list(ORTHONORMALISE)}, not {self.orthonormalise!r}"
-            )
+            raise ValueError(f"orthonormalise must be one of {list(ORTHONORMALISE)}, not {self.orthonormalise!r}")
         if self.attitude == "quaternion" and self.orthonormalise is not None:
             raise ValueError('orthonormalise needs attitude="matrix"; a quaternion is normalised')
 

@@ -34,6 +34,4 @@ class Shape:
             value = getattr(self, field.name)
             for v in value if isinstance(value, tuple) else (value,):
                 if not (math.isfinite(v) and v > 0):
-                    raise ValueError(
-                        f"{owner}: {self.kind} {field.name} = {value} must be finite and > 0 [m]"
-                    )
+                    raise ValueError(f"{owner}: {self.kind} {field.name} = {value} must be finite and > 0 [m]")

@@ -69,9 +69,7 @@ class MujocoNewton(Solver):
         x = _velocities(cs, free, p, problem)
         p, x = _newton(cs, laws, p, x, problem)
         impulse, turn = dense.on_bodies(cs, p, problem)
-        return Solution(
-            impulse=impulse, angular_impulse=turn, contacts=p, unconverged=_unconverged(cs, laws, p, x)
-        )
+        return Solution(impulse=impulse, angular_impulse=turn, contacts=p, unconverged=_unconverged(cs, laws, p, x))
 
     def _search_minimum(self, cs, laws, free, problem: Problem):
         """Newton's method with an exact line search; returns the impulses."""

@@ -71,7 +71,9 @@ def solve(problem: Problem, recovery) -> Solution:
         t1, t2 = (friction.dot(t)[None] for t in rows.tangents)
         p = p + friction
     p = materialise(p, one)
-    spread = lambda v: Vec3(*(add_rows(jnp.zeros_like(z), rows.b, c, unique=True) for z, c in zip(components(problem.v), components(v))))
+    spread = lambda v: Vec3(
+        *(add_rows(jnp.zeros_like(z), rows.b, c, unique=True) for z, c in zip(components(problem.v), components(v)))
+    )
     impulse = spread(p)
     turn = None
     if problem.w is not None:

@@ -120,7 +120,9 @@ class _Law:
 
 def _law(g: _Group, bias, touching, scale, soft) -> _Law:
     if g.events is None:
-        return _Law(bias, jnp.where(touching, scale, 1.0).astype(bias.dtype), jnp.where(touching, soft, 0.0).astype(bias.dtype))
+        return _Law(
+            bias, jnp.where(touching, scale, 1.0).astype(bias.dtype), jnp.where(touching, soft, 0.0).astype(bias.dtype)
+        )
     hit = g.events.active
     touching = touching & ~hit
     return _Law(
@@ -178,7 +180,13 @@ def _prepare(rows: Rows, problem: Problem) -> _Group:
         return jnp.where(rows.live, 1.0, 0.0).astype(rows.phi.dtype) / k(d, central_b, central_a)
 
     return _Group(
-        rows, t1, t2, mb, ma, ib, ia,
+        rows,
+        t1,
+        t2,
+        mb,
+        ma,
+        ib,
+        ia,
         mass_n=mass(rows.n, rows.central_b, rows.central_a),
         mass_1=mass(t1) if t1 is not None else None,
         mass_2=mass(t2) if t2 is not None else None,
@@ -200,7 +208,9 @@ def _apply(g: _Group, lam: Impulses, body):
     total = p.map(lambda c: c.sum(0))
 
     def side(v, w, index, inv_mass, inertia, arm, sign):
-        v = Vec3(*(add_rows(c, index, sign * inv_mass * d) for c, d in zip((v.x, v.y, v.z), (total.x, total.y, total.z))))
+        v = Vec3(
+            *(add_rows(c, index, sign * inv_mass * d) for c, d in zip((v.x, v.y, v.z), (total.x, total.y, total.z)))
+        )
         if w is not None and not (rows.mu is None and (rows.central_b if sign > 0 else rows.central_a)):
             turn = inertia @ arm.cross(p).map(lambda c: c.sum(0))
             w = Vec3(*(add_rows(c, index, sign * d) for c, d in zip((w.x, w.y, w.z), (turn.x, turn.y, turn.z))))
@@ -224,6 +234,7 @@ def _sweep(g: _Group, law: _Law, lam: Impulses, body, one):
         return _sweep_colours(g, law, lam, body, one)
     pieces = []
     for start, stop in colours:
+
         def cut(x, axis):
             """This colour's pairs; arrays that are the same for all pairs stay as they are."""
             same = lambda c: whole or jnp.ndim(c) <= axis or c.shape[axis] == 1
@@ -394,8 +405,16 @@ def _sweep_rolled(g: _Group, law: _Law, lam: Impulses, body, one):
         return jax.tree.map(lambda c: c if jnp.ndim(c) == 0 else jnp.moveaxis(spread(c), axis, 0), x)
 
     static_part = (
-        rows.b, rows.a, by_pair(rows.n, 0), by_pair(g.t1, 0), by_pair(g.t2, 0), by_pair(rows.mu, 0),
-        by_pair(g.inv_mass_b, 0), by_pair(g.inv_mass_a, 0), by_pair(g.inertia_b, 0), by_pair(g.inertia_a, 0),
+        rows.b,
+        rows.a,
+        by_pair(rows.n, 0),
+        by_pair(g.t1, 0),
+        by_pair(g.t2, 0),
+        by_pair(rows.mu, 0),
+        by_pair(g.inv_mass_b, 0),
+        by_pair(g.inv_mass_a, 0),
+        by_pair(g.inertia_b, 0),
+        by_pair(g.inertia_a, 0),
     )
     slots = by_pair((rows.rb, rows.ra, rows.surface, g.mass_n, g.mass_1, g.mass_2, law, lam), 1)
     # scalars of the law are loop constants

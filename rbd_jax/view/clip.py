@@ -68,9 +68,7 @@ class Clip:
         self.pos = _finite("pos", self.pos)
         self.quat = _finite("quat", self.quat)
         if self.time.ndim != 1 or self.pos.ndim != 4 or self.pos.shape[-1] != 3:
-            raise ValueError(
-                f"clip: time {self.time.shape} and pos {self.pos.shape} must be (T,) and (W, T, n, 3)"
-            )
+            raise ValueError(f"clip: time {self.time.shape} and pos {self.pos.shape} must be (T,) and (W, T, n, 3)")
         W, T, n = self.pos.shape[:3]
         if self.quat.shape != (W, T, n, 4) or self.time.shape != (T,):
             raise ValueError(
@@ -176,10 +174,7 @@ class Clip:
         if moving.any():
             centre = np.median(at[moving], 0)
             away = np.linalg.norm(at - centre, axis=-1)
-            start = [
-                np.linalg.norm(self.poses(w, 0)[0][0] - centre, axis=-1)[solid & (self.body >= 0)]
-                for w in worlds
-            ]
+            start = [np.linalg.norm(self.poses(w, 0)[0][0] - centre, axis=-1)[solid & (self.body >= 0)] for w in worlds]
             limit = max(1.3 * np.max(start), 2.0 * np.quantile(away[moving], 0.75))
             near = moving & (away <= limit + radius)
             reach = (away + radius)[near].max()
