@@ -402,7 +402,8 @@ def report(env, rows, extra, seconds):
     ratios = [
         [TITLES[k], f"{v['batch']:,}"]
         + [f"{number(v[c])} {verdict(v[c], OVERHEAD_BAR)}" for c in ("vmap_over_rollout", "scan_over_rollout")]
-        for k, v in extra.items()
+        for k, rows_of_scene in extra.items()
+        for v in rows_of_scene
     ]
     return f"""# Throughput
 
@@ -474,7 +475,8 @@ def main(args) -> int:
         if not args.smoke:
             keep(measure(name, "accurate", (accurate,), args, env, steps, mj_worlds))
         if name in ("ball", "box", "stack") and args.devices == 1:
-            extra[name] = overheads(name, args, steps, min(batches[0], mj_worlds))
+            sizes = {min(batches[0], mj_worlds), *(batches if name != "stack" else ())}
+            extra[name] = [overheads(name, args, steps, size) for size in sorted(sizes)]
             new = [{**env, "benchmark": "overhead", "scene": name, "method": "fast", "dt": DT, **extra[name]}]
             common.append_lines(out / "throughput.jsonl", new)
     (out / "throughput.md").write_text(report(env, rows, extra, time.perf_counter() - begin), encoding="utf-8")
