@@ -477,7 +477,8 @@ def main(args) -> int:
         if name in ("ball", "box", "stack") and args.devices == 1:
             sizes = {min(batches[0], mj_worlds), *(batches if name != "stack" else ())}
             extra[name] = [overheads(name, args, steps, size) for size in sorted(sizes)]
-            new = [{**env, "benchmark": "overhead", "scene": name, "method": "fast", "dt": DT, **extra[name]}]
+            same = {**env, "benchmark": "overhead", "scene": name, "method": "fast", "dt": DT}
+            new = [{**same, **row} for row in extra[name]]
             common.append_lines(out / "throughput.jsonl", new)
     (out / "throughput.md").write_text(report(env, rows, extra, time.perf_counter() - begin), encoding="utf-8")
     print(f"wrote {out / 'throughput.jsonl'}, {out / 'throughput.md'}  ({time.perf_counter() - begin:.0f} s)")
