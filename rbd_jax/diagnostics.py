@@ -5,6 +5,8 @@ All accept any batch axes and trajectories; model leaves with batch axes are ali
 
 from __future__ import annotations
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +15,7 @@ from .detect import detect
 from .model import Model, batch_of
 from .spatial import Vec3, pack
 from .state import State, Wrench, to_public
-from .status import MESSAGE
+from .status import MESSAGE, Status
 from .step import enter, with_memory
 from .struct import struct
 
@@ -191,10 +193,11 @@ class SimulationError(RuntimeError):
 def check(state: State) -> State:
     """Return ``state`` if every world is well, else raise, naming world, status and remedy.
 
-    Call it outside jit. A trajectory is checked over all its samples.
+    Call it outside jit. A trajectory is checked over all its samples. NOT_CONVERGED alone warns
+    (RuntimeWarning): the solver stopped early in some step, the state is sound.
 
     Raises:
-      SimulationError: some world has a status bit set.
+      SimulationError: some world has another status bit set.
     """
     status = np.asarray(state.status)
     bad = np.argwhere(status != 0)
@@ -209,4 +212,8 @@ def check(state: State) -> State:
             first = tuple(where[0])
             at = int(np.asarray(state.step)[first])
             lines.append(f"world {names}{more}: {bit.name}: {cause} (step {at}). Remedy: {remedy}.")
-    raise SimulationError("\n".join(lines), tuple(int(i) for i in np.flatnonzero(status)))
+    spoilt = status & ~np.asarray(int(Status.NOT_CONVERGED), status.dtype)
+    if not spoilt.any():
+        warnings.warn("\n".join(lines), RuntimeWarning, stacklevel=2)
+        return state
+    raise SimulationError("\n".join(lines), tuple(int(i) for i in np.flatnonzero(spoilt)))

@@ -279,6 +279,14 @@ def test_diverged_world_is_frozen_and_its_neighbours_do_not_notice(worlds):
     assert caught.value.worlds == (1,)
 
 
+def test_an_unconverged_solver_warns_and_the_rest_raises(worlds):
+    model, states = worlds
+    with pytest.warns(RuntimeWarning, match="world 2: NOT_CONVERGED.*Remedy"):
+        rbd.check(states.replace(status=jnp.array([0, 0, 4], jnp.uint32)))
+    with pytest.raises(rbd.SimulationError, match="world 0: CAPACITY"):
+        rbd.check(states.replace(status=jnp.array([2, 0, 4], jnp.uint32)))
+
+
 def test_energy_momentum_inertia_agree_with_numpy(worlds):
     model, states = worlds
     m, half = float(model.mass[0]), np.array([0.1, 0.15, 0.2])
