@@ -101,7 +101,7 @@ def test_isotropic_body_needs_one_exponential_and_no_trigonometry_elsewhere():
 def test_bodies_on_static_ground_are_not_coupled():
     """Many spheres on a plane: the program is that of one, with no gather and no scatter."""
     many = rbd.Scene(
-        [rbd.Body(f"b{i}", SPHERE, pos=(i, 0, 1), friction=1.0, **_apart(i)) for i in range(5)],
+        [rbd.Body(f"b{i}", SPHERE, pos=(i, 0, 1), friction=1.0) for i in range(5)],
         static=[rbd.Plane()],
         pairs=[rbd.Pair(f"b{i}", f"b{j}", exclude=True) for i in range(5) for j in range(i)],
     )
@@ -109,10 +109,6 @@ def test_bodies_on_static_ground_are_not_coupled():
     ops = step_operations(many)
     assert len(ops) <= len(step_operations(one)) + 20  # sums over bodies
     assert not {"gather", "scatter", "scatter-add"} & set(names(ops))
-
-
-def _apart(i):
-    return {}
 
 
 def test_a_value_of_zero_is_compiled_in():

@@ -7,6 +7,7 @@ arrays that broadcast to (P, B): P pairs, B worlds (batch innermost).
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 
 from ..spatial import Quat, Vec3
 from ..struct import struct
@@ -37,3 +38,14 @@ class Manifold:
     distance: jax.Array
     live: jax.Array
     feature: jax.Array
+
+
+def one_point(normal: Vec3, point: Vec3, distance: jax.Array, margin) -> Manifold:
+    """The manifold of a pair that touches in one point; arguments (P, B)."""
+    return Manifold(
+        normal=normal,
+        point=point.map(lambda c: c[None]),
+        distance=distance[None],
+        live=distance[None] < margin,
+        feature=jnp.zeros((1, 1), jnp.int32),
+    )

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
-
 from ..shapes import Box
 from ..xla import materialise
-from .base import Manifold, Pose
+from .base import Manifold, Pose, one_point
 
 
 def sphere_box(a: Pose, b: Pose, size_a, size_b, margin, one=1.0) -> Manifold:
@@ -20,10 +18,4 @@ def sphere_box(a: Pose, b: Pose, size_a, size_b, margin, one=1.0) -> Manifold:
     n = materialise(-b.q.rotate(gradient), one)
     gap = sdf - radius
     point = a.x + n * (radius + 0.5 * gap)
-    return Manifold(
-        normal=n,
-        point=point.map(lambda c: c[None]),
-        distance=gap[None],
-        live=gap[None] < margin,
-        feature=jnp.zeros((1, 1), jnp.int32),
-    )
+    return one_point(n, point, gap, margin)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from ..spatial import Vec3
-from .base import Manifold, Pose
+from .base import Manifold, Pose, one_point
 
 
 def plane_sphere(a: Pose, b: Pose, size_a, size_b, margin, one=1.0) -> Manifold:
@@ -15,11 +15,4 @@ def plane_sphere(a: Pose, b: Pose, size_a, size_b, margin, one=1.0) -> Manifold:
     n = Vec3(2 * (q.x * q.z + q.w * q.y), 2 * (q.y * q.z - q.w * q.x), 1 - 2 * (q.x * q.x + q.y * q.y))
     gap = n.dot(b.x - a.x) - radius
     point = b.x - n * (radius + 0.5 * gap)
-    like = gap[None]
-    return Manifold(
-        normal=n.map(lambda c: c + jnp.zeros_like(gap)),
-        point=point.map(lambda c: c[None]),
-        distance=like,
-        live=like < margin,
-        feature=jnp.zeros((1, 1), jnp.int32),
-    )
+    return one_point(n.map(lambda c: c + jnp.zeros_like(gap)), point, gap, margin)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from ..spatial import Vec3, safe_norm, unit_or
-from .base import Manifold, Pose
+from .base import Manifold, Pose, one_point
 
 
 def sphere_sphere(a: Pose, b: Pose, size_a, size_b, margin, one=1.0) -> Manifold:
@@ -17,10 +17,4 @@ def sphere_sphere(a: Pose, b: Pose, size_a, size_b, margin, one=1.0) -> Manifold
     n = unit_or(d, Vec3(zero, zero, zero + 1))
     gap = length - ra - rb
     point = a.x + n * (ra + 0.5 * gap)
-    return Manifold(
-        normal=n,
-        point=point.map(lambda c: c[None]),
-        distance=gap[None],
-        live=gap[None] < margin,
-        feature=jnp.zeros((1, 1), jnp.int32),
-    )
+    return one_point(n, point, gap, margin)

@@ -17,8 +17,7 @@ class Shape:
     * ``size``: the sizes as a flat tuple of floats,
     * ``mass_properties(density)``: mass [kg] and principal inertia [kg m^2] in the shape's frame,
     * ``sdf(size, p)``: exact signed distance [m] (negative inside) and its unit gradient at the
-      local point ``p`` (a Vec3), with traced sizes,
-    * ``bounding_radius(size)``: radius about the origin of a sphere that holds the shape [m].
+      local point ``p`` (a Vec3), with traced sizes.
     """
 
     kind: ClassVar[str]

@@ -55,8 +55,3 @@ class Box(Shape):
         face = Vec3(jnp.where(on_x, one, zero), jnp.where(on_y, one, zero), jnp.where(on_x | on_y, zero, one))
         distance = jnp.where(outside, length, deepest)
         return distance, where(outside, unit_or(m, face), face) * sign
-
-    @staticmethod
-    def bounding_radius(size):
-        a, b, c = size
-        return (a * a + b * b + c * c) ** 0.5

@@ -26,7 +26,3 @@ class Plane(Shape):
         """z and (0, 0, 1)."""
         zero, one = jnp.zeros_like(p.z), jnp.ones_like(p.z)
         return p.z, Vec3(zero, zero, one)
-
-    @staticmethod
-    def bounding_radius(size):
-        return float("inf")

@@ -34,7 +34,3 @@ class Sphere(Shape):
         (radius,) = size
         zero, one = jnp.zeros_like(p.x), jnp.ones_like(p.x)
         return safe_norm(p) - radius, unit_or(p, Vec3(zero, zero, one))
-
-    @staticmethod
-    def bounding_radius(size):
-        return size[0]
