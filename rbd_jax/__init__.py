@@ -16,6 +16,7 @@ from .model import Model
 from .rollout import rollout, step
 from .scene import Body, Geom, Pair, Scene
 from .shapes import Box, Plane, Sphere
+from .solvers import CONTACT_MODELS, SOLVERS
 from .state import State, Wrench, batch
 from .status import Status
 
@@ -23,6 +24,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Body",
+    "CONTACT_MODELS",
     "Box",
     "Contacts",
     "Geom",
@@ -31,6 +33,7 @@ __all__ = [
     "PRESETS",
     "Pair",
     "Plane",
+    "SOLVERS",
     "Scene",
     "SimulationError",
     "Sphere",

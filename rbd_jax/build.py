@@ -11,17 +11,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from .contact import NARROW
+from .contact.broadphase import SLOP, bits, key_of, no_key
 from .method import Method, find
-from .model import Group, Model, Structure
+from .model import Choice, Group, Model, Structure
 from .scene import Scene, resolve, rotation
 from .shapes import SHAPES
+from .solvers.gauss_seidel import UNROLL
 from .solvers.mujoco_law import MujocoLaw
-from .solvers.tgs import UNROLL
 from .spatial import Quat, Vec3
 from .state import Kinematic, State
 
 #: Groups with more pairs than this choose their pairs at run time (a box pair costs far more than a ball pair).
 DENSE_PAIRS = {("box", "box"): 100, ("sphere", "box"): 600, ("sphere", "sphere"): 2100}
+#: From this many places on (geoms of side A times geoms of side B) the pairs are searched on a grid, if that has less.
+GRID_PAIRS = 8_000_000
 RANK = {shape.kind: i for i, shape in enumerate(SHAPES)}
 ISOTROPIC = 1e-9
 
@@ -52,8 +55,8 @@ def build(scene: Scene, dt: float | None = None, method: str | Method = "accurat
     dt = float(scene.dt if dt is None else dt)
     if not (np.isfinite(dt) and dt > 0):
         raise ValueError(f"build: dt = {dt} must be finite and > 0 [s]")
-    method = find(method).resolve(dt, scene.integrator)
     r = resolve(scene)
+    method = find(method).resolve(dt, scene.integrator, *_boxes_that_touch(r))
     dtype = jnp.result_type(float)
     n = len(r.mass)
 
@@ -61,7 +64,12 @@ def build(scene: Scene, dt: float | None = None, method: str | Method = "accurat
     kinds = np.array([s.kind for s in r.geom_shapes])
     frames = _principal_frames(r)
     centred = (category != "dynamic") | _near(r.geom_pos, r.com[np.maximum(r.geom_body, 0)])
-    groups = _groups(r, kinds, category, centred, method, n)
+    groups = _groups(r, kinds, category, centred, method, scene, dt)
+    if any(g.torsion for g in groups) and not method.solver.spins:
+        raise ValueError(
+            f"Method: solver '{method.solver.name}' has no torsional or rolling friction, which this scene gives; "
+            "use method='mujoco', or leave them out (condim 3)"
+        )
     attitude = _needs_attitude(r, groups, kinds, category, centred)
     if groups and method.solver.level == "velocity" and not method.integrator.contact:
         raise ValueError(
@@ -81,6 +89,7 @@ def build(scene: Scene, dt: float | None = None, method: str | Method = "accurat
     has = lambda flags, values: jnp.asarray(values, dtype) if np.any(flags) else None
     box = kinds == "box"
     any_friction = any(g.friction for g in groups)
+    any_torsion, any_rolling = any(g.torsion for g in groups), any(g.rolling for g in groups)
     any_restitution = any(g.restitution for g in groups)
     overrides = list(r.overrides.values())
     own = lambda name: jnp.asarray(_override_values(overrides, name), dtype)
@@ -104,7 +113,7 @@ def build(scene: Scene, dt: float | None = None, method: str | Method = "accurat
         geom_pos = geom_quat = None
     else:
         geom_pos, geom_quat = jnp.asarray(r.geom_pos[posed], dtype), jnp.asarray(r.geom_quat[posed], dtype)
-    mujoco = method.contact == "mujoco"
+    mujoco = method.contact.name == "mujoco"
     model = Model(
         structure,
         method,
@@ -117,6 +126,10 @@ def build(scene: Scene, dt: float | None = None, method: str | Method = "accurat
         restitution=jnp.asarray(r.geom_restitution, dtype) if any_restitution else None,
         pair_friction=own("friction") if overridden and any_friction else None,
         pair_restitution=own("restitution") if overridden and any_restitution else None,
+        torsional_friction=jnp.asarray(r.geom_torsional_friction, dtype) if any_torsion else None,
+        rolling_friction=jnp.asarray(r.geom_rolling_friction, dtype) if any_rolling else None,
+        pair_torsional_friction=own("torsional_friction") if overridden and any_torsion else None,
+        pair_rolling_friction=own("rolling_friction") if overridden and any_rolling else None,
         radius=has(kinds == "sphere", [s.radius for s in r.geom_shapes if s.kind == "sphere"]),
         half_extents=has(box, [s.half_extents for s in r.geom_shapes if s.kind == "box"]),
         geom_pos=geom_pos,
@@ -206,10 +219,24 @@ def _needs_attitude(r, groups, kinds, category, centred) -> bool:
 # --- pairs ---
 
 
-def _groups(r, kinds, category, centred, method: Method, n: int) -> tuple[Group, ...]:
+def _boxes_that_touch(r) -> tuple[int, float, float]:
+    """Number of bodies whose boxes may touch another body's, the smallest edge of these boxes [m], their mass ratio."""
+    box = np.array([s.kind == "box" for s in r.geom_shapes])
+    moving = np.array(["dynamic", "kinematic", "static"])[r.geom_category] == "dynamic"
+    geoms = np.unique(r.pairs[(box & moving)[r.pairs].all(axis=1)]) if len(r.pairs) else []
+    if not len(geoms):
+        return 0, 1.0, 1.0
+    bodies = np.unique(r.geom_body[geoms])
+    size = 2.0 * min(min(r.geom_shapes[g].half_extents) for g in geoms)
+    return len(bodies), size, r.mass[bodies].max() / r.mass[bodies].min()
+
+
+def _groups(r, kinds, category, centred, method: Method, scene: Scene, dt: float) -> tuple[Group, ...]:
     if not len(r.pairs):
         return ()
     _, friction = r.pair_friction()
+    _, torsion = r.pair_torsional_friction()
+    _, rolling = r.pair_rolling_friction()
     _, restitution = r.pair_restitution()
     override = np.full(len(r.pairs), -1)
     for k, row in enumerate(r.overrides):
@@ -223,10 +250,25 @@ def _groups(r, kinds, category, centred, method: Method, n: int) -> tuple[Group,
     a, b = np.where(swap, second, first), np.where(swap, first, second)
     partner = np.where(fixed[a], category[a], np.where(fixed[b], category[b], "dynamic"))
     flip = fixed[b]
-    key = list(zip(kinds[a], kinds[b], partner, flip, sphere_at_com[a], sphere_at_com[b], friction, restitution))
-    groups = []
-    for k in sorted(set(key), key=lambda k: (k[2] == "dynamic", *map(str, k))):
-        rows = np.array([i for i, other in enumerate(key) if other == k])
+    one, two = r.pair_sources()
+    source_a, source_b = np.where(swap, two, one), np.where(swap, one, two)
+    same = (kinds[a], kinds[b], partner, flip, sphere_at_com[a], sphere_at_com[b], friction, restitution)
+    # the pairs of every combination: one number a pair, as there may be a million
+    values, code = [], np.zeros(len(a), np.int64)
+    for column in (*same, torsion, rolling):
+        value, inverse = np.unique(column, return_inverse=True)
+        values.append(value)
+        code = code * len(value) + inverse
+    key = {}
+    for c in np.unique(code).tolist():
+        left, parts = c, []
+        for value in reversed(values):
+            left, i = divmod(left, len(value))
+            parts.append(value[i])
+        key[tuple(reversed(parts))] = np.flatnonzero(code == c)
+    groups, sizes = [], _sizes(r)
+    for k in sorted(key, key=lambda k: (k[2] == "dynamic", *map(str, k))):
+        rows = key[k]
         kind = (str(k[0]), str(k[1]))
         if kind not in NARROW:
             raise ValueError(
@@ -235,9 +277,10 @@ def _groups(r, kinds, category, centred, method: Method, n: int) -> tuple[Group,
             )
         ga, gb = a[rows], b[rows]
         body_a, body_b = r.geom_body[ga], r.geom_body[gb]
-        capacity = None
+        capacity = choice = None
         if len(rows) > DENSE_PAIRS.get(kind, 10**9):
-            capacity = min(len(rows), method.capacity or 8 * n)
+            choice = _choice(r, kind, a, b, rows, override, sizes, method)
+            capacity = _capacity(r, kind, (a[rows], b[rows]), sizes, category, method, scene, dt)
         if k[2] == "dynamic":
             ends = np.stack([body_a, body_b], 1)
         else:
@@ -257,14 +300,123 @@ def _groups(r, kinds, category, centred, method: Method, n: int) -> tuple[Group,
                 bool(k[5]),
                 bool(k[6]),
                 bool(k[7]),
+                bool(k[8]),
+                bool(k[9]),
+                source_a[rows][order],
+                source_b[rows][order],
                 override[rows][order],
                 rows[order],
                 colours,
                 capacity,
                 padding,
+                choice,
             )
         )
     return tuple(groups)
+
+
+def _sizes(r) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Half-extents (g, 3), radius of the enclosing ball (g,) and volume (g,) of spheres and boxes; zero for the rest."""
+    half, radius, volume = np.zeros((len(r.geom_shapes), 3)), np.zeros(len(r.geom_shapes)), np.zeros(len(r.geom_shapes))
+    for k, shape in enumerate(r.geom_shapes):
+        if shape.kind == "sphere":
+            half[k], radius[k], volume[k] = shape.radius, shape.radius, 4.19 * shape.radius**3
+        elif shape.kind == "box":
+            half[k] = shape.half_extents
+            radius[k], volume[k] = np.linalg.norm(half[k]), 8.0 * np.prod(half[k])
+    return half, radius, volume
+
+
+def _choice(r, kind, a, b, rows, override, sizes, method: Method) -> Choice:
+    """How a group chooses among its pairs ``rows`` (of geoms a, b) at run time."""
+    a, b = a[rows], b[rows]
+    list_a, list_b = np.unique(a), np.unique(b)
+    same = kind[0] == kind[1] and len(np.intersect1d(list_a, list_b)) > 0
+    if same:
+        list_a = list_b = np.union1d(list_a, list_b)
+        a, b = np.minimum(a, b), np.maximum(a, b)
+    i, j = np.searchsorted(list_a, a), np.searchsorted(list_b, b)
+    count_a, count_b = len(list_a), len(list_b)
+    keys = key_of(i, j, count_b)
+    # a cell as wide as the largest geom holds so many of the usual ones, and a geom looks at 27 cells
+    _, radius, volume = sizes
+    both = np.union1d(list_a, list_b)
+    crowd = 1.0 + 0.7 * (2.2 * radius[both].max()) ** 3 / np.median(volume[both])
+    candidates = int(27 * crowd * (0.5 * count_a if same else count_b))
+    full = len(rows) == (count_a * (count_a - 1) // 2 if same else count_a * count_b)
+    if count_a * count_b < GRID_PAIRS or candidates > count_a * count_b // 8:
+        candidates = None
+    own = np.flatnonzero(override[rows] >= 0)
+    own = own[np.argsort(keys[own])]
+    priority = (r.geom_priority[list_a], r.geom_priority[list_b])
+    equal = len(np.unique(np.concatenate(priority))) == 1
+    law_rows, law_of = rows[:1], None
+    if method.contact.name == "mujoco":
+        margin, solref, solimp = (x[rows] for x in r.pair_softness())
+        _, first, which = np.unique(
+            np.column_stack([margin, solref, solimp]), axis=0, return_index=True, return_inverse=True
+        )
+        law_rows = rows[first]
+        if len(first) > 1:
+            law_of = np.zeros(no_key(count_a, count_b) + 1, np.int32)
+            law_of[keys] = which.ravel()
+    return Choice(
+        a=list_a,
+        b=list_b,
+        body_a=r.geom_body[list_a],
+        body_b=r.geom_body[list_b],
+        same=same,
+        allowed=None if full and not (same and candidates is None) else bits(i, j, count_a, count_b),
+        candidates=candidates,
+        override_keys=keys[own],
+        override_rows=override[rows][own],
+        priority=None if equal else priority,
+        law_rows=law_rows,
+        law_of=law_of,
+    )
+
+
+def _capacity(r, kind, pair, sizes, category, method: Method, scene: Scene, dt: float) -> int:
+    """Places for pairs: what the method says, or 8 a moving geom and half as many again as start close.
+
+    Raises:
+      ValueError: more start close than the method gives places.
+    """
+    used = np.unique(np.concatenate(pair))
+    x, turn = np.zeros((len(category), 3)), np.zeros((len(category), 3, 3))
+    reach = np.zeros(len(category))
+    h = dt / method.substeps
+    fall = 0.0 if scene.gravity is None else h * np.linalg.norm(scene.gravity)
+    for k in used.tolist():
+        x[k], turn[k], body = r.geom_pos[k], rotation(r.geom_quat[k]), r.geom_body[k]
+        if category[k] != "static":
+            name = "" if category[k] == "dynamic" else "kinematic_"
+            frame = rotation(getattr(r, name + "quat")[body])
+            x[k], turn[k] = getattr(r, name + "pos")[body] + frame @ x[k], frame @ turn[k]
+            reach[k] = h * (np.linalg.norm(getattr(r, name + "vel")[body]) + (fall if name == "" else 0.0))
+    half, radius, _ = sizes
+    balls = kind == ("sphere", "sphere")
+    spread = np.array([s.kind == "sphere" for s in r.geom_shapes])[:, None]
+    wide = np.where(spread, half, np.einsum("kij,kj->ki", np.abs(turn), half))
+    count = 0
+    for start in range(0, len(pair[0]), 1_000_000):
+        a, b = (side[start : start + 1_000_000] for side in pair)
+        grown = SLOP * np.minimum(half[a].min(1), half[b].min(1)) + reach[a] + reach[b]
+        d = np.abs(x[b] - x[a])
+        if balls:
+            near = (d * d).sum(1) < (radius[a] + radius[b] + grown) ** 2
+        else:
+            near = (d - wide[a] - wide[b]).max(1) < grown
+        count += int(near.sum())
+    if method.capacity is None:
+        moving = int((category[used] == "dynamic").sum())
+        return min(len(pair[0]), max(8 * moving, count + count // 2))
+    if count > method.capacity:
+        raise ValueError(
+            f"Method: capacity = {method.capacity} is too small: {count} {kind[0]}-{kind[1]} pairs are close to each "
+            f"other at the start; it must be at least {count}, with room for those that come"
+        )
+    return min(len(pair[0]), method.capacity)
 
 
 def _colour(ends: np.ndarray) -> tuple[np.ndarray, tuple[tuple[int, int], ...]]:
@@ -309,18 +461,18 @@ def _padded(order: np.ndarray, colours, slots: int):
 
 
 def _mujoco_laws(r, groups, scene: Scene, dtype) -> tuple[MujocoLaw, ...]:
-    """MuJoCo's softness of the pairs of every group, leaves (P,)."""
+    """MuJoCo's softness of the pairs of every group, leaves (P,); of a ``Choice`` its different ones."""
     margin, solref, solimp = r.pair_softness()
     column = lambda a: jnp.asarray(a, dtype)
     return tuple(
         MujocoLaw(
-            *(column(solref[g.rows, k]) for k in range(2)),
-            *(column(solimp[g.rows, k]) for k in range(5)),
-            margin=column(margin[g.rows]),
+            *(column(solref[rows, k]) for k in range(2)),
+            *(column(solimp[rows, k]) for k in range(5)),
+            margin=column(margin[rows]),
             impratio=column([scene.impratio]),
             refsafe=bool(scene.refsafe),
         )
-        for g in groups
+        for rows in (g.rows if g.choice is None else g.choice.law_rows for g in groups)
     )
 
 

@@ -11,20 +11,30 @@ import numpy as np
 
 from .contact import NARROW
 from .contact.base import Manifold, Pose
-from .contact.broadphase import compact, half_widths, lookup, separation
-from .model import Group, GroupParams, Params, Structure
+from .contact.broadphase import (
+    SLOP,
+    Bounds,
+    all_pairs,
+    at,
+    below,
+    grid_pairs,
+    half_widths,
+    key_of,
+    lookup,
+    no_key,
+    rows_of_key,
+)
+from .model import Coefficient, Group, GroupParams, Params, Structure
 from .solvers.rows import Impulses, Index, Rows, take, take_tree
-from .spatial import safe_norm
+from .spatial import Quat, Vec3, safe_norm
 from .state import World
 from .struct import struct
 
-#: Slots up to this part of a box's size above the surface count as contact points of the manifold.
-SLOP = 0.02
-
-
 @struct
 class Contact:
-    """A group in one step: its manifold, rows, impulses of the last step, those to start from, the chosen pairs."""
+    """A group in one step: its manifold, rows, impulses of the last step, those to start from, the keys of the
+    pairs that were chosen and whether there were too many, and the numbers of its pairs.
+    """
 
     manifold: Manifold
     rows: Rows
@@ -32,18 +42,17 @@ class Contact:
     warm: Impulses
     pairs: jax.Array | None
     overflow: jax.Array | None
+    numbers: GroupParams
 
 
-def detect(s: Structure, p: Params, world: World, model_of_contact: str | None) -> tuple[Contact, ...]:
+def detect(s: Structure, p: Params, world: World, reach_of_model: str) -> tuple[Contact, ...]:
     """Contacts of every group, with the slots alive that the contact model wants.
 
-    "soft": every slot, however far (a distant row does nothing); "near_rigid": those that may touch
-    within the step; "mujoco" and None: those that touch, or are closer than MuJoCo's margin.
+    "all": every slot, however far (a distant row does nothing); "step": those that may touch
+    within the step; "margin": those that touch, or are closer than MuJoCo's margin.
     """
-    reach = _reach(p, world) if model_of_contact == "near_rigid" or any(g.capacity for g in s.groups) else None
-    return tuple(
-        _group(g, gp, p, world, i, reach, model_of_contact) for i, (g, gp) in enumerate(zip(s.groups, p.groups))
-    )
+    reach = _reach(p, world) if reach_of_model == "step" or any(g.capacity for g in s.groups) else None
+    return tuple(_group(g, gp, p, world, i, reach, reach_of_model) for i, (g, gp) in enumerate(zip(s.groups, p.groups)))
 
 
 def _reach(p: Params, world: World) -> jax.Array:
@@ -53,65 +62,178 @@ def _reach(p: Params, world: World) -> jax.Array:
     return p.h * (safe_norm(bodies.v) + g)
 
 
-def _group(g: Group, gp: GroupParams, p: Params, world: World, number: int, reach, model_of_contact) -> Contact:
-    pairs = overflow = None
-    local_a, local_b, size_a, size_b = gp.local_a, gp.local_b, gp.size_a, gp.size_b
-    body_a, body_b = Index(g.body_a), Index(g.body_b)
-    mu, e, law = gp.mu, gp.e, gp.law
-    if g.capacity is not None:
-        pairs, overflow = _choose(g, gp, world, reach)
-        chosen = jnp.minimum(pairs, len(g.a) - 1)
-        body_a, body_b = (jnp.asarray(rows)[chosen] for rows in (np.maximum(g.body_a, 0), np.maximum(g.body_b, 0)))
-        local_a, local_b, size_a, size_b, mu, e, law = take_tree((local_a, local_b, size_a, size_b, mu, e, law), chosen)
-    pose_a = _pose(world, _side(g, "a"), body_a, local_a)
-    pose_b = _pose(world, _side(g, "b"), body_b, local_b)
-    margin = jnp.inf if model_of_contact == "soft" else 0.0
+def _sweep_of(p: Params, world: World) -> jax.Array:
+    """How far a kinematic body goes in a step [m], (k, B)."""
+    return p.h * safe_norm(world.kinematic.v)
+
+
+@struct
+class Selected:
+    """The pairs of a group that are looked at: their bodies and numbers, (P, 1 or B).
+
+    body_a, body_b: as in ``Rows``, of the geoms A and B. places: which of the group's pairs they are where
+    that differs from world to world, (P, B), else None. filled: places that hold a pair, None = all.
+    """
+
+    body_a: Index | jax.Array
+    body_b: Index | jax.Array
+    numbers: GroupParams
+    places: jax.Array | None = None
+    filled: jax.Array | None = None
+
+
+def everything(g: Group, gp: GroupParams) -> Selected:
+    """All pairs of a group."""
+    if g.choice is not None:
+        i, j = np.searchsorted(g.choice.a, g.a), np.searchsorted(g.choice.b, g.b)
+        gp = _numbers(g, gp, *(jnp.asarray(x, jnp.int32)[:, None] for x in (i, j)))
+    return Selected(Index(g.body_a), Index(g.body_b), gp)
+
+
+def chosen(g: Group, gp: GroupParams, keys: jax.Array) -> Selected:
+    """The pairs of these keys (C, B) of a group that chooses its pairs at run time."""
+    i, j = geoms_of(g, keys)
+    body = lambda rows, k: jnp.asarray(np.maximum(rows, 0), jnp.int32)[k]
+    c = g.choice
+    filled = keys < no_key(len(c.a), len(c.b))
+    return Selected(body(c.body_a, i), body(c.body_b, j), _numbers(g, gp, i, j), keys, filled)
+
+
+def geoms_of(g: Group, keys: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Rows of the geoms of keys in the lists of ``g.choice``; an empty place has any."""
+    c = g.choice
+    i, j = rows_of_key(keys, len(c.b))
+    return jnp.minimum(i, len(c.a) - 1), j
+
+
+def _numbers(g: Group, gp: GroupParams, i: jax.Array, j: jax.Array) -> GroupParams:
+    """Numbers of the pairs of rows i and j (P, B) of the lists of ``g.choice``."""
+    c = g.choice
+    key = key_of(i, j, len(c.b))
+    count = len(c.override_keys)
+    if count:
+        known = jnp.asarray(c.override_keys, jnp.int32)[:, None]
+        place = jnp.minimum(below(known, key), count - 1)
+        given = at(known, place) == key
+        row = at(jnp.asarray(c.override_rows, jnp.int32)[:, None], place)
+
+    def coefficient(x: Coefficient | None, priority=None):
+        """Larger of the two geoms (or that of the higher priority), then the pair's own value."""
+        if x is None:
+            return None
+        a, b = take(x.a, i), take(x.b, j)
+        value = jnp.maximum(a, b)
+        if priority is not None:
+            pa, pb = (jnp.asarray(p, jnp.int32)[k] for p, k in zip(priority, (i, j)))
+            value = jnp.where(pa > pb, a, jnp.where(pb > pa, b, value))
+        if x.own is None:
+            return value
+        own = take(x.own, row)
+        return jnp.where(given & ~jnp.isnan(own), own, value)
+
+    law = gp.law
     if law is not None:
-        margin = law.margin
-    if model_of_contact == "near_rigid":
-        near = SLOP * min_size(g.kind, size_a, size_b)
-        margin = near + sum(
-            take(reach, i) for c, i in ((_side(g, "a"), body_a), (_side(g, "b"), body_b)) if c == "dynamic"
-        )
-    m = NARROW[g.kind].function(pose_a, pose_b, size_a, size_b, margin, one=p.one)
-    if pairs is not None:
-        m = m._with(live=m.live & (pairs < len(g.a))[None])
-    if g.padding is not None:
-        m = m._with(live=m.live & ~g.padding[:, None])
-    # the moving body of a one-body row is B, and the normal points to it
+        which = jnp.zeros_like(key) if c.law_of is None else jnp.asarray(c.law_of, jnp.int32)[key]
+        law = take_tree(law, which)
+    return GroupParams(
+        take_tree(gp.size_a, i),
+        take_tree(gp.size_b, j),
+        take_tree(gp.local_a, i),
+        take_tree(gp.local_b, j),
+        coefficient(gp.mu, c.priority),
+        coefficient(gp.e),
+        law,
+        coefficient(gp.mu_spin, c.priority),
+        coefficient(gp.mu_roll, c.priority),
+    )
+
+
+def pick(selected: Selected, places: jax.Array) -> Selected:
+    """The pairs at ``places`` (P, B) of ``selected``, each world its own."""
+    body = lambda i: (
+        jnp.asarray(np.maximum(i.rows, 0))[places] if isinstance(i, Index) else jnp.take_along_axis(i, places, axis=0)
+    )
+    filled = selected.filled
+    return Selected(
+        body(selected.body_a),
+        body(selected.body_b),
+        take_tree(selected.numbers, places),
+        places,
+        None if filled is None else jnp.take_along_axis(filled, places, axis=0),
+    )
+
+
+def manifold(g: Group, selected: Selected, world: World, margin, one) -> Manifold:
+    """Contact points of the selected pairs at the poses of ``world``."""
+    n = selected.numbers
+    pose_a = pose_of(world, side_of(g, "a"), selected.body_a, n.local_a)
+    pose_b = pose_of(world, side_of(g, "b"), selected.body_b, n.local_b)
+    m = NARROW[g.kind].function(pose_a, pose_b, n.size_a, n.size_b, margin, one=one)
+    return m if selected.filled is None else m._with(live=m.live & selected.filled[None])
+
+
+def rows_of(g: Group, selected: Selected, m: Manifold, world: World) -> Rows:
+    """Contact rows of a manifold. The moving body of a one-body row is B, and the normal points to it."""
+    numbers = selected.numbers
     flip = g.flip
-    n = -m.normal if flip else m.normal
-    index_b = body_a if flip else body_b
-    index_a = body_a if g.category == "dynamic" else None
+    index_b = selected.body_a if flip else selected.body_b
+    index_a = selected.body_a if g.category == "dynamic" else None
     arm = lambda index: m.point - take_tree(world.bodies.x, index)
-    surface = None
+    surface = surface_spin = None
     if g.category == "kinematic":
-        index = body_b if flip else body_a
+        index = selected.body_b if flip else selected.body_a
         k = world.kinematic
         r = m.point - take_tree(k.x, index)
         surface = take_tree(k.v, index) + take_tree(k.w, index).cross(r)
-    feature = m.feature if g.features else None
-    rows = Rows(
-        n=n,
+        surface_spin = take_tree(k.w, index) if g.torsion else None
+    return Rows(
+        n=-m.normal if flip else m.normal,
         rb=arm(index_b),
         phi=m.distance,
         live=m.live,
         b=index_b,
         a=index_a,
         ra=arm(index_a) if index_a is not None else None,
-        mu=mu,
-        e=e,
+        mu=numbers.mu,
+        e=numbers.e,
         surface=surface,
-        feature=feature,
-        law=law,
+        mu_spin=numbers.mu_spin,
+        mu_roll=numbers.mu_roll,
+        surface_spin=surface_spin,
+        feature=m.feature if g.features else None,
+        law=numbers.law,
         central_a=g.central_a and index_a is not None,
         central_b=g.central_a if flip else g.central_b,
         colours=g.colours,
     )
-    last = _last(g, world, number, pairs, feature)
+
+
+def _group(g: Group, gp: GroupParams, p: Params, world: World, number: int, reach, reach_of_model) -> Contact:
+    pairs = overflow = None
+    if g.choice is None:
+        selected = everything(g, gp)
+    else:
+        pairs, overflow = _choose(g, gp, p, world, reach)
+        selected = chosen(g, gp, pairs)
+    margin = jnp.inf if reach_of_model == "all" else 0.0
+    if gp.law is not None:
+        margin = selected.numbers.law.margin
+    if reach_of_model == "step" or (reach_of_model == "all" and g.capacity is not None):
+        margin = SLOP * min_size(g.kind, selected.numbers.size_a, selected.numbers.size_b) + sum(
+            take(reach, i)
+            for c, i in ((side_of(g, "a"), selected.body_a), (side_of(g, "b"), selected.body_b))
+            if c == "dynamic"
+        )
+        if g.choice is not None and g.category == "kinematic":
+            margin = margin + take(_sweep_of(p, world), selected.body_b if g.flip else selected.body_a)
+    m = manifold(g, selected, world, margin, p.one)
+    if g.padding is not None:
+        m = m._with(live=m.live & ~g.padding[:, None])
+    rows = rows_of(g, selected, m, world)
+    last = _last(g, world, number, pairs, rows.feature)
     again = m.live & (last.n > 0)  # negative: an impact
     warm = jax.tree.map(lambda c: jnp.where(again, c, 0.0), last)
-    return Contact(m, rows, last, warm, pairs, overflow)
+    return Contact(m, rows, last, warm, pairs, overflow, selected.numbers)
 
 
 def min_size(kind, size_a, size_b):
@@ -122,42 +244,59 @@ def min_size(kind, size_a, size_b):
     return least
 
 
-def _side(g: Group, side: str) -> str:
+def side_of(g: Group, side: str) -> str:
     if g.category == "dynamic" or (side == "a") == g.flip:
         return "dynamic"
     return g.category
 
 
-def _pose(world: World, category: str, index, local: Pose | None) -> Pose:
+def place(x: Vec3, q: Quat | None, local: Pose | None) -> Pose:
+    """World pose of geoms at ``local`` on bodies at x, q."""
+    if local is None:
+        return Pose(x, q)
+    return Pose(x + q.rotate(local.x), q @ local.q)
+
+
+def pose_of(world: World, category: str, index, local: Pose | None) -> Pose:
     """World pose of geoms, (P, B) or (P, 1)."""
     if category == "static":
         return local
     frame = world.bodies if category == "dynamic" else world.kinematic
     x = take_tree(frame.x, index)
     q = None if frame.q is None else take_tree(frame.q, index)
-    if local is None:
-        return Pose(x, q)
-    return Pose(x + q.rotate(local.x), q @ local.q)
+    return place(x, q, local)
 
 
-def _choose(g: Group, gp: GroupParams, world: World, reach):
-    """Pairs whose bounding boxes, grown by the reach of their bodies, overlap."""
-    a = _pose(world, _side(g, "a"), Index(g.body_a), gp.local_a)
-    b = _pose(world, _side(g, "b"), Index(g.body_b), gp.local_b)
-    gap = separation(a, half_widths(g.kind[0], gp.size_a, a), b, half_widths(g.kind[1], gp.size_b, b))
-    grown = SLOP * min_size(g.kind, gp.size_a, gp.size_b)
-    for side, rows in (("a", g.body_a), ("b", g.body_b)):
-        if _side(g, side) == "dynamic":
-            grown = grown + take(reach, Index(rows))
+def _choose(g: Group, gp: GroupParams, p: Params, world: World, reach):
+    """Keys of the pairs that may touch within the step, and whether there are too many."""
+    c = g.choice
+
+    def bounds(side: str, bodies, local, size) -> Bounds:
+        category = side_of(g, side)
+        pose = pose_of(world, category, Index(bodies), local)
+        half = half_widths(g.kind["ab".index(side)], size, pose)
+        slop = SLOP * min_size(g.kind, size, ())
+        if category == "static":
+            return Bounds(pose.x, half, slop, jnp.zeros_like(slop))
+        way = reach if category == "dynamic" else _sweep_of(p, world)
+        return Bounds(pose.x, half, slop, take(way, Index(bodies)))
+
+    balls = g.kind == ("sphere", "sphere")
+    a = bounds("a", c.body_a, gp.local_a, gp.size_a)
+    b = a if c.same else bounds("b", c.body_b, gp.local_b, gp.size_b)
     worlds = world.bodies.x.x.shape[-1]
-    return compact(jnp.broadcast_to(gap < grown, (len(g.a), worlds)), g.capacity)
+    if c.candidates is None:
+        keys, overflow = all_pairs(a, b, balls, c.allowed, g.capacity)
+    else:
+        keys, overflow = grid_pairs(a, None if c.same else b, balls, c.allowed, g.capacity, c.candidates)
+    return jnp.broadcast_to(keys, (g.capacity, worlds)), jnp.broadcast_to(overflow, (worlds,))
 
 
 def _last(g: Group, world: World, number: int, pairs, feature) -> Impulses:
     """Impulses of the last step for the same pair and the same features, zero elsewhere."""
     last = world.contacts[number]
     if pairs is not None:
-        place = lookup(pairs, world.pairs[number], len(g.a))
+        place = lookup(pairs, world.pairs[number])
         known = place < pairs.shape[0]
         safe = jnp.where(known, place, 0)
         last = jax.tree.map(lambda c: jnp.where(known[None], jnp.take_along_axis(c, safe[None], axis=1), 0.0), last)

@@ -115,7 +115,7 @@ def contacts(model: Model, state: State) -> Contacts:
     b = world.bodies
     w = None if b.L is None else p.inertia.velocity(b.q, b.L)
     parts = []
-    for g, gp, c in zip(model.structure.groups, p.groups, detect(model.structure, p, world, "soft")):
+    for g, gp, c in zip(model.structure.groups, p.groups, detect(model.structure, p, world, "all")):
         parts.append(_points(model, g, gp, c, c.last._with(n=jnp.abs(c.last.n)), p, b, w))
     shape = b.x.x.shape[-1:]
     if not parts:
@@ -142,7 +142,7 @@ def contacts(model: Model, state: State) -> Contacts:
 
 def _points(model, g, gp, c, lam, p, b, w):
     """Flat (S P, B) arrays of one group, normal from A to B of the canonical pair."""
-    from .detect import min_size
+    from .detect import geoms_of, min_size
     from .solvers.restitution import normal_velocity
 
     rows = c.rows
@@ -157,22 +157,21 @@ def _points(model, g, gp, c, lam, p, b, w):
     u = normal_velocity(rows, b.v, w)
     g_h = 0.0 if p.gravity is None else jnp.sqrt(p.gravity.dot(p.gravity)) * p.h
     slow = RESTING * g_h + 1e-3
-    least = min_size(g.kind, gp.size_a, gp.size_b)
-    if c.pairs is not None:
-        least = least.min()
+    least = min_size(g.kind, c.numbers.size_a, c.numbers.size_b)
     live = rows.live & ((rows.phi <= 1e-3 * least) | (lam.n > 0))
     kind = jnp.where(live, jnp.where(u < -slow, 2, jnp.where(u > slow, 3, 1)), 0)
-    index = lambda rows_: (
-        jnp.asarray(rows_)[:, None] if c.pairs is None else jnp.asarray(rows_)[jnp.minimum(c.pairs, len(rows_) - 1)]
-    )
+    if c.pairs is None:
+        geoms = [jnp.asarray(x)[:, None] for x in (g.a, g.b)]
+    else:
+        geoms = [jnp.asarray(x)[k] for x, k in zip((g.choice.a, g.choice.b), geoms_of(g, c.pairs))]
     moving = lambda side: g.category == "dynamic" or (side == "a") == g.flip
-    body = lambda side, rows_: index(rows_ if moving(side) else np.full(len(rows_), -1))
+    body = lambda side, geom: jnp.asarray(model.structure.geom_body)[geom] if moving(side) else jnp.full_like(geom, -1)
     vec = lambda v: v.map(flat)
     return (
-        flat(body("a", g.body_a)),
-        flat(body("b", g.body_b)),
-        flat(index(g.a)),
-        flat(index(g.b)),
+        flat(body("a", geoms[0])),
+        flat(body("b", geoms[1])),
+        flat(geoms[0]),
+        flat(geoms[1]),
         vec(c.manifold.point),
         vec(c.manifold.normal),
         flat(rows.phi),

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
-from .integrators import Integrator, make as make_integrator
-from .solvers import SOLVERS, NewtonLagged, Solver
+from .integrators import Integrator, Splitting, make as make_integrator
+from .solvers import CONTACT_MODELS, SOLVERS, ContactModel, NewtonLagged, Solver
 
-#: Longest substep of ``substeps=None`` with the TGS solver [s].
+#: Longest substep of ``substeps=None`` with a solver that is better split than solved harder [s].
 SUBSTEP = 1.0 / 240.0
+#: ``solver=None``: sweeps carry the load of a stack of this many boxes of this size [m] in a step of SUBSTEP,
+STACK, STACK_SIZE = 8, 0.2
+#: and masses up to this ratio;
+RATIO = 10.0
+#: a direct solve costs less than the substeps of a larger one up to this many boxes.
+DIRECT = 64
 
 
 @dataclasses.dataclass(frozen=True)
@@ -17,22 +24,38 @@ class Method:
 
     Attributes:
       integrator: a name of ``rbd_jax.integrators.INTEGRATORS`` or an instance.
-      contact: contact model: "soft" (frequency and damping ratio tied to the step), "near_rigid",
-        or "mujoco" (solref, solimp).
-      solver: "tgs", "newton_lagged", "mujoco", or an instance; each speaks one contact model.
-      substeps: steps inside a step of dt; None: 1, or for "tgs" as many as keep a substep within
+      contact: contact model, a name of ``rbd_jax.CONTACT_MODELS`` ("soft", "hertz", "near_rigid", "baumgarte",
+        "spring", "mujoco") or an instance; None: the solver's own.
+      solver: a name of ``rbd_jax.SOLVERS`` ("tgs", "pgs", "newton_lagged", "penalty", "mujoco") or an
+        instance. Any goes with any model, but "mujoco", which speaks its own only. None: the cheapest that stands:
+        "tgs", or three Newton steps of "newton_lagged" where 2 to 64 boxes may touch each other and sweeps would need
+        substeps for that, which is where dt > 1/240 s min(1, 8 / boxes) min(1, sqrt(size / 0.2 m)) or where
+        their masses differ by more than 10 : 1.
+      substeps: steps inside a step of dt; None: 1, or for "tgs" and "penalty" as many as keep a substep within
         1/240 s at the dt of ``build``.
+      events: impacts a world may have in a (sub)step at their own instant, with the position and normal they
+        have there; what follows the last of them is a step of the remaining length. 0: none, an impact is
+        resolved at the normal of the start of the step. An approach slower than max((1 - e) / 2, 0.02) h |a| is no
+        event: the body has come to rest.
       capacity: pairs kept per world by groups that choose theirs at run time; None: 8 a body.
     """
 
     integrator: str | Integrator = "symtop2"
-    contact: str | None = None
-    solver: str | Solver = "tgs"
+    contact: str | ContactModel | None = None
+    solver: str | Solver | None = "tgs"
     substeps: int | None = None
     capacity: int | None = None
+    events: int = 0
 
-    def resolve(self, dt: float, scene_integrator: str | None = None) -> Method:
+    def resolve(
+        self, dt: float, scene_integrator: str | None = None, boxes: int = 0, size: float = 1.0, ratio: float = 1.0
+    ) -> Method:
         """Names replaced by instances and ``substeps`` by a number.
+
+        Args:
+          dt: step [s]. scene_integrator: what "scene" stands for.
+          boxes, size, ratio: number of boxes that may touch each other, the smallest edge of one [m], the
+            largest mass over the smallest.
 
         Raises:
           ValueError: an unknown name, a combination of model and solver that does not exist,
@@ -43,6 +66,10 @@ class Method:
             integrator = "mujoco_" + (scene_integrator or "euler")
         integrator = make_integrator(integrator)
         solver = self.solver
+        if solver is None:
+            sweeps = SUBSTEP * min(1.0, STACK / max(boxes, 1)) * min(1.0, math.sqrt(size / STACK_SIZE))
+            direct = 2 <= boxes <= DIRECT and (dt > sweeps or ratio > RATIO)
+            solver = NewtonLagged(iterations=3) if direct and self.contact in (None, "near_rigid") else "tgs"
         if isinstance(solver, str):
             if solver not in SOLVERS:
                 raise ValueError(f"Method: unknown solver '{solver}'; known: {', '.join(SOLVERS)}")
@@ -50,25 +77,39 @@ class Method:
         if not isinstance(solver, Solver):
             raise ValueError(f"Method: solver = {solver!r} must be a name or a Solver")
         contact = self.contact or solver.contact
-        if contact != solver.contact:
-            raise ValueError(f"Method: solver '{solver.name}' speaks contact model '{solver.contact}', not '{contact}'")
+        if isinstance(contact, str):
+            if contact not in CONTACT_MODELS:
+                raise ValueError(f"Method: unknown contact model '{contact}'; known: {', '.join(CONTACT_MODELS)}")
+            contact = CONTACT_MODELS[contact]()
+        if not isinstance(contact, ContactModel):
+            raise ValueError(f"Method: contact = {contact!r} must be a name or a ContactModel")
+        if solver.models is not None and contact.name not in solver.models:
+            known = ", ".join(solver.models)
+            raise ValueError(f"Method: solver '{solver.name}' speaks contact model '{known}', not '{contact.name}'")
         for field in ("substeps", "capacity"):
             value = getattr(self, field)
             if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
                 raise ValueError(f"Method: {field} = {value!r} must be an integer >= 1")
+        if not isinstance(self.events, int) or isinstance(self.events, bool) or self.events < 0:
+            raise ValueError(f"Method: events = {self.events!r} must be an integer >= 0")
+        if self.events and (solver.level != "velocity" or not isinstance(integrator, Splitting)):
+            raise ValueError(
+                f"Method: events need a solver of velocities and a splitting integrator (symtop2, symtop4, buss2), not "
+                f"'{solver.name}' with '{integrator.name}'"
+            )
         substeps = self.substeps
         if substeps is None:
-            substeps = max(1, round(dt / SUBSTEP + 0.49)) if solver.name == "tgs" else 1
+            substeps = max(1, round(dt / SUBSTEP + 0.49)) if solver.substeps else 1
         if substeps > MAX_SUBSTEPS:
             raise ValueError(f"Method: dt = {dt} s needs {substeps} substeps, at most {MAX_SUBSTEPS}: use a smaller dt")
-        return Method(integrator, contact, solver, substeps, self.capacity)
+        return Method(integrator, contact, solver, substeps, self.capacity, self.events)
 
 
 #: Substeps are a compiled loop, but a step that needs more than this is a wrong dt.
 MAX_SUBSTEPS = 1000
 
 PRESETS = {
-    "fast": Method("symtop2", "soft", "tgs"),
+    "fast": Method("symtop2", None, None),
     "accurate": Method("symtop4", "near_rigid", NewtonLagged(iterations=8)),
     "gradient": Method("symtop2", "near_rigid", NewtonLagged(iterations=8)),
     "mujoco": Method("scene", "mujoco", "mujoco"),

@@ -6,6 +6,7 @@ What MJCF has no field for is written under ``<custom>``, in elements named
 
     rbd_restitution:GEOM   restitution [-]
     rbd_friction:GEOM      a friction coefficient [-] that is a value although 0 or on a geom of condim 1
+    rbd_torsional_friction:GEOM, rbd_rolling_friction:GEOM   the same [m], of condim below 4 or 6
     rbd_vel:BODY           velocity [m/s]: of a mocap body's origin; of a free body's centre of mass
     rbd_omega:BODY         angular velocity, world [rad/s]
     rbd_drag               drag rate, or (linear, angular) [1/s]
@@ -16,7 +17,7 @@ What MJCF has no field for is written under ``<custom>``, in elements named
     rbd_pairs              (text, JSON) overrides and exclusions as the scene wrote them
     rbd_jax                (text) format of these elements; only in exported files
 
-GEOM is a geom's name or its automatic one. The first five may be written by hand. Where MuJoCo has a field of its
+GEOM is a geom's name or its automatic one. The first seven may be written by hand. Where MuJoCo has a field of its
 own, that field wins: a custom digit string is used only if it agrees with the compiled model.
 """
 
@@ -32,6 +33,7 @@ import mujoco
 import numpy as np
 
 from .scene import (
+    CONDIMS,
     DYNAMIC,
     KINEMATIC,
     STATIC,
@@ -49,6 +51,9 @@ from .shapes import Box, Plane, Shape, Sphere
 KEEP = ("friction", "omega", "vel", "gravity")
 FORMAT = "1"
 START_KEY = "start"
+#: Where MuJoCo keeps each coefficient: in a geom's three numbers, in a pair's five.
+GEOM_FRICTION = dict(zip(CONDIMS, (0, 1, 2)))
+PAIR_FRICTION = dict(zip(CONDIMS, (0, 2, 3)))
 AGREE = 1e-10  # [-] relative; a custom value this near to the compiled one is the same number with more digits
 ROUNDING = 1e-15  # entries of a rotation this near to -1, 0, 1 come from a quarter turn
 
@@ -233,7 +238,7 @@ class _Reader:
         bodies = {self.body_names[b] for b in self.free + self.mocap}
         geoms = set(self.labels.values())
         rules = {  # kind -> (allowed counts, whose name follows)
-            "rbd_restitution": ((1,), geoms), "rbd_friction": ((1,), geoms), "rbd_vel": ((3,), bodies),
+            "rbd_restitution": ((1,), geoms), **{f"rbd_{f}": ((1,), geoms) for f in CONDIMS}, "rbd_vel": ((3,), bodies),
             "rbd_omega": ((3,), bodies), "rbd_mass": ((1,), bodies), "rbd_density": ((1,), bodies),
             "rbd_com": ((3,), bodies), "rbd_inertia": ((3, 9), bodies), "rbd_drag": ((1, 2), None),
             "rbd_gravity": ((3,), None),
@@ -315,8 +320,6 @@ class _Reader:
             kind = int(m.geom_type[g])
             if kind not in _SHAPES:
                 out.append(f"{who}: {_GEOM_TYPES.get(kind, kind)} geom; only sphere, box and plane are simulated")
-            if m.geom_condim[g] not in (1, 3):
-                out.append(f"{who}: condim = {m.geom_condim[g]} (torsional/rolling friction); must be 1 or 3")
             if m.geom_margin[g] < 0:
                 out.append(f"{who}: margin = {m.geom_margin[g]:g} [m] (shrinks the geom); must be >= 0")
             for field, value, what in (
@@ -326,8 +329,6 @@ class _Reader:
             ):
                 if value:
                     out.append(f"{who}: {field} = {value:g} ({what}); must be 0")
-        if len({int(m.geom_priority[g]) for g in active}) > 1:
-            out.append("geom priority: geoms differ in it; contacts combine by the larger friction (use contact/pair)")
         mixed = {(*m.geom_solref[g], *m.geom_solimp[g]) for g in active}
         if len({float(m.geom_solmix[g]) for g in active}) > 1 and len(mixed) > 1:
             out.append("geom solmix: geoms differ in it; solref and solimp are averaged evenly (use contact/pair)")
@@ -347,13 +348,12 @@ class _Reader:
         for p in range(m.npair):
             who = self._label("pair", mujoco.mjtObj.mjOBJ_PAIR, p)
             friction = m.pair_friction[p]
-            if m.pair_dim[p] not in (1, 3):
-                out.append(f"{who}: condim = {m.pair_dim[p]} (torsional/rolling friction); must be 1 or 3")
-            elif m.pair_dim[p] == 3 and friction[0] != friction[1]:
-                out.append(
-                    f"{who}: friction = {friction[0]:g} {friction[1]:g} (anisotropic); the first two must be equal "
-                    "(MuJoCo takes 1 for a second that is not given)"
-                )
+            for least, one, two, which in ((3, 0, 1, "first"), (6, 3, 4, "last")):
+                if m.pair_dim[p] >= least and friction[one] != friction[two]:
+                    out.append(
+                        f"{who}: friction = {friction[one]:g} {friction[two]:g} (anisotropic); the {which} two must be "
+                        f"equal (MuJoCo takes its default for a second that is not given)"
+                    )
             if m.pair_margin[p] < 0:
                 out.append(f"{who}: margin = {m.pair_margin[p]:g} [m]; must be >= 0")
             for field, value in (
@@ -419,7 +419,7 @@ class _Reader:
         return sorted({(int(s) >> 16, int(s) & 0xFFFF) for s in self.m.exclude_signature})
 
     def scene(self):
-        """Build it. A geom of condim 1 or friction 0 becomes frictionless where that changes no contact."""
+        """Build it. A coefficient that is 0 or beyond a geom's condim is absent where that changes no contact."""
         kept = set()
         while True:
             scene = self._assemble(kept)
@@ -429,15 +429,18 @@ class _Reader:
             kept |= changed
 
     def _wrong_friction(self, scene):
-        """Geoms of pairs whose friction differs from MuJoCo's (the larger value, if the larger condim is 3)."""
+        """(geom, coefficient) of pairs that differ from MuJoCo's: the larger value, if the larger condim has it."""
         m, r = self.m, resolve(scene)
         if not len(r.pairs):
             return set()
-        ids = np.array(self.order)[r.pairs]
-        theirs = np.where(m.geom_condim[ids].max(1) == 3, m.geom_friction[ids, 0].max(1), 0.0)
-        wrong = theirs != r.pair_friction()[0]
-        wrong[[row for row in r.overrides]] = False
-        return {int(g) for g in ids[wrong].ravel()}
+        ids = np.array(self.order)[np.stack(r.pair_sources(), axis=1)]
+        out = set()
+        for field, (ours, _) in _pair_coefficients(r).items():
+            value = m.geom_friction[ids, GEOM_FRICTION[field]].max(1)
+            wrong = np.where(m.geom_condim[ids].max(1) >= CONDIMS[field], value, 0.0) != ours
+            wrong[[row for row in r.overrides]] = False
+            out |= {(int(g), field) for g in ids[wrong].ravel()}
+        return out
 
     def _assemble(self, kept):
         m = self.m
@@ -488,14 +491,12 @@ class _Reader:
             pos = _turn(m.body_quat[body], pos) + m.body_pos[body]
             quat = _times(m.body_quat[body], quat)
             body = int(m.body_parentid[body])
-        mu, condim = float(m.geom_friction[g, 0]), int(m.geom_condim[g])
-        hint = self.numeric.get(f"rbd_friction:{label}")
-        if hint is not None and _close(hint[0], mu):
-            friction = mu
-        elif g in kept or (condim == 3 and (mu != 0 or "friction" in self.keep)):
-            friction = mu
-        else:
-            friction = None
+        condim = int(m.geom_condim[g])
+        values = {f: float(m.geom_friction[g, k]) for f, k in GEOM_FRICTION.items()}
+        hints = {f: self.numeric.get(f"rbd_{f}:{label}") for f in CONDIMS}
+        hinted = {f for f, hint in hints.items() if hint is not None and _close(hint[0], values[f])}
+        surface = self._present(values, condim, hinted | {f for f in CONDIMS if (g, f) in kept})
+        natural = max([1, *(least for f, least in CONDIMS.items() if surface[f] is not None)])
         restitution = self.restitution
         if restitution is None:
             restitution = self.numeric.get(f"rbd_restitution:{label}", (None,))[0]
@@ -505,7 +506,7 @@ class _Reader:
             shape=_SHAPES[int(m.geom_type[g])](m.geom_size[g]),
             pos=tuple(pos),
             quat=tuple(quat),
-            friction=friction,
+            **surface,
             restitution=restitution,
             group=int(m.geom_contype[g]),
             mask=int(m.geom_conaffinity[g]),
@@ -513,8 +514,15 @@ class _Reader:
             margin=max(float(m.geom_margin[g]), 0.0),  # negative only where nothing collides
             solref=tuple(m.geom_solref[g]),
             solimp=tuple(m.geom_solimp[g]),
-            condim=1 if condim == 1 and friction is not None else 3,
+            condim=condim if condim < natural else None,
+            priority=int(m.geom_priority[g]),
         )
+
+    def _present(self, values, condim, also=()):
+        """Coefficients of friction: those up to the last that condim has and that is not 0, or is in ``also``."""
+        zero = "friction" in self.keep
+        there = [f in also or (condim >= least and (values[f] != 0 or zero)) for f, least in CONDIMS.items()]
+        return {f: values[f] if any(there[k:]) else None for k, f in enumerate(CONDIMS)}
 
     def _body(self, b, geoms):
         m, name = self.m, self.body_names[b]
@@ -594,12 +602,11 @@ class _Reader:
             bodies = {int(m.geom_bodyid[g1]), int(m.geom_bodyid[g2])}
             if not free & bodies or len(bodies) == 1:
                 continue
-            mu, condim = float(m.pair_friction[p, 0]), int(m.pair_dim[p])
-            absent = condim == 1 or (mu == 0 and "friction" not in self.keep)
+            values = {f: float(m.pair_friction[p, k]) for f, k in PAIR_FRICTION.items()}
             out.append(
                 Pair(
-                    self.labels[g1], self.labels[g2], friction=None if absent else mu, margin=float(m.pair_margin[p]),
-                    solref=tuple(m.pair_solref[p]), solimp=tuple(m.pair_solimp[p]),
+                    self.labels[g1], self.labels[g2], **self._present(values, int(m.pair_dim[p])),
+                    margin=float(m.pair_margin[p]), solref=tuple(m.pair_solref[p]), solimp=tuple(m.pair_solimp[p]),
                 )
             )  # fmt: skip
         return out
@@ -623,9 +630,13 @@ def _same_contacts(a: ResolvedScene, b: ResolvedScene) -> bool:
     """Whether both have the same pairs with the same numbers, as far as MJCF knows them."""
     if not np.array_equal(a.pairs, b.pairs):
         return False
-    ours = (a.pair_friction()[0], *a.pair_softness())
-    theirs = (b.pair_friction()[0], *b.pair_softness())
+    ours, theirs = ((*(v for v, _ in _pair_coefficients(r).values()), *r.pair_softness()) for r in (a, b))
     return all(np.allclose(x, y, rtol=AGREE, atol=1e-300) for x, y in zip(ours, theirs))
+
+
+def _pair_coefficients(r: ResolvedScene) -> dict:
+    """Values and presence of each coefficient of friction."""
+    return {f: getattr(r, "pair_" + f)() for f in CONDIMS}
 
 
 def _times(p, q):
@@ -760,13 +771,15 @@ def _write_body(world, body, **attributes):
 def _write_geoms(parent, r, category, body):
     for g in np.flatnonzero((r.geom_category == category) & (r.geom_body == body)):
         shape = r.geom_shapes[g]
-        ET.SubElement(
+        element = ET.SubElement(
             parent, "geom", name=r.geom_names[g], type=shape.kind, size=_digits(_mujoco_size(shape)),
             pos=_digits(r.geom_pos[g]), quat=_digits(r.geom_quat[g]),
-            friction=f"{_digits(r.geom_friction[g])} 0.005 0.0001", condim=str(r.geom_condim[g]),
+            friction=_digits([getattr(r, "geom_" + f)[g] for f in GEOM_FRICTION]), condim=str(r.geom_condim[g]),
             contype=str(r.geom_group[g]), conaffinity=str(r.geom_mask[g]), margin=_digits(r.geom_margin[g]),
             solref=_digits(r.geom_solref[g]), solimp=_digits(r.geom_solimp[g]),
         )  # fmt: skip
+        if r.geom_priority[g]:
+            element.set("priority", str(r.geom_priority[g]))
 
 
 def _mujoco_size(shape: Shape):
@@ -821,8 +834,10 @@ def _write_geom_custom(custom, r):
     for g, label in enumerate(r.geom_names):
         if r.geom_has_restitution[g]:
             custom.numeric[f"rbd_restitution:{label}"] = r.geom_restitution[g]
-        if r.geom_has_friction[g] and (r.geom_friction[g] == 0 or r.geom_condim[g] == 1):
-            custom.numeric[f"rbd_friction:{label}"] = r.geom_friction[g]
+        for field, least in CONDIMS.items():
+            value = getattr(r, "geom_" + field)[g]
+            if getattr(r, "geom_has_" + field)[g] and (value == 0 or r.geom_condim[g] < least):
+                custom.numeric[f"rbd_{field}:{label}"] = value
 
 
 def _write_contact(root, r, custom):
@@ -837,14 +852,15 @@ def _write_contact(root, r, custom):
     element = ET.SubElement(root, "contact")
     for one, two in sorted(cut):
         ET.SubElement(element, "exclude", body1=_body_name(scene, one), body2=_body_name(scene, two))
-    mu, has = r.pair_friction()
+    mu, spin, roll = (value for value, _ in _pair_coefficients(r).values())
+    condim = r.pair_condim()
     margin, solref, solimp = r.pair_softness()
     for (a, b), row in left.items():
         if row not in r.overrides and (body_of[a], body_of[b]) not in cut:
             continue
         ET.SubElement(
-            element, "pair", geom1=r.geom_names[a], geom2=r.geom_names[b], condim="3" if has[row] else "1",
-            friction=f"{_digits((mu[row], mu[row]))} 0.005 0.0001 0.0001", margin=_digits(margin[row]),
+            element, "pair", geom1=r.geom_names[a], geom2=r.geom_names[b], condim=str(condim[row]),
+            friction=_digits([v[row] for v in (mu, mu, spin, roll, roll)]), margin=_digits(margin[row]),
             solref=_digits(solref[row]), solimp=_digits(solimp[row]),
         )  # fmt: skip
     plain = Pair("a", "b")

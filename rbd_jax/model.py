@@ -18,8 +18,34 @@ from .bodies import Inertia
 from .contact import NARROW
 from .contact.base import Pose
 from .method import Method
+from .scene import CONDIMS
 from .spatial import Quat, Vec3
 from .struct import static, struct
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """How a group with many pairs chooses them at run time (numpy, static); see ``contact.broadphase`` for keys.
+
+    a, b: geoms of both sides, ascending; one list if ``same`` (pairs i < j). body_a, body_b: their bodies.
+    allowed: bits of the pairs of the group among all of them, None = all. candidates: places of the search on
+    a grid, None: everything is compared with everything. override_keys: keys of pairs with values of their own,
+    ascending; override_rows: rows of the model's pair leaves. priority: of the geoms of both sides, None = equal.
+    law_rows: rows of the resolved pairs whose contact laws differ; law_of: which of them a key has, None = the first.
+    """
+
+    a: np.ndarray
+    b: np.ndarray
+    body_a: np.ndarray
+    body_b: np.ndarray
+    same: bool
+    allowed: np.ndarray | None
+    candidates: int | None
+    override_keys: np.ndarray
+    override_rows: np.ndarray
+    priority: tuple[np.ndarray, np.ndarray] | None
+    law_rows: np.ndarray
+    law_of: np.ndarray | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,8 +55,10 @@ class Group:
     a, b: geom rows of the pairs in canonical order of kinds. body_a, body_b: rows of the dynamic or
     kinematic body. category: what the partner is. flip: the moving body is A, so the normal of the
     narrow phase points away from it. central_*: the geom is a sphere whose centre is the centre of
-    mass. friction, restitution: whether any pair has them. capacity: None, or how many pairs are
-    kept at run time. override: rows of the model's pair leaves, -1 = none. rows: rows of the resolved pairs.
+    mass. friction, restitution, torsion, rolling: whether its pairs have them. source_a, source_b: geoms
+    whose friction combines (``ResolvedScene.pair_sources``). capacity: None, or how many pairs are kept at
+    run time, as ``choice`` says. override: rows of the model's pair leaves, -1 = none. rows: rows of the
+    resolved pairs.
     padding: pairs that repeat another one to give the colours one width; their slots are dead.
     """
 
@@ -45,11 +73,16 @@ class Group:
     central_b: bool
     friction: bool
     restitution: bool
+    torsion: bool
+    rolling: bool
+    source_a: np.ndarray
+    source_b: np.ndarray
     override: np.ndarray
     rows: np.ndarray
     colours: tuple[tuple[int, int], ...] = ()
     capacity: int | None = None
     padding: np.ndarray | None = None
+    choice: Choice | None = None
 
     @property
     def moving(self) -> tuple[np.ndarray | None, np.ndarray]:
@@ -86,7 +119,7 @@ class Structure:
 
 def _plain(value):
     if isinstance(value, np.ndarray):
-        return (value.shape, value.tobytes())
+        return (value.shape, str(value.dtype), hashlib.sha1(np.ascontiguousarray(value)).hexdigest())
     if dataclasses.is_dataclass(value):
         return tuple(_plain(getattr(value, f.name)) for f in dataclasses.fields(value))
     if isinstance(value, (tuple, list)):
@@ -112,6 +145,10 @@ BASE_NDIM = dict(
     static_quat=2,
     pair_friction=1,
     pair_restitution=1,
+    torsional_friction=1,
+    rolling_friction=1,
+    pair_torsional_friction=1,
+    pair_rolling_friction=1,
     com=2,
     principal=2,
 )
@@ -127,6 +164,7 @@ class Model:
       mass: (n,) [kg]. inertia: (n,) when all bodies are isotropic, else (n, 3) principal moments in
         the order of the body's axes [kg m^2].
       friction, restitution: (g,) [-]. pair_friction, pair_restitution: (overridden pairs,).
+      torsional_friction, rolling_friction: (g,) [m]. pair_torsional_friction, pair_rolling_friction: likewise.
       radius: (spheres,) [m]. half_extents: (boxes, 3) [m], both in geom order.
       geom_pos, geom_quat: (geoms of bodies, 3 | 4) in the body frame; static_pos, static_quat: of
         static geoms in the world.
@@ -145,6 +183,10 @@ class Model:
     restitution: jax.Array | None = None
     pair_friction: jax.Array | None = None
     pair_restitution: jax.Array | None = None
+    torsional_friction: jax.Array | None = None
+    rolling_friction: jax.Array | None = None
+    pair_torsional_friction: jax.Array | None = None
+    pair_rolling_friction: jax.Array | None = None
     radius: jax.Array | None = None
     half_extents: jax.Array | None = None
     geom_pos: jax.Array | None = None
@@ -210,9 +252,9 @@ def _check_number(name: str, value: np.ndarray) -> None:
         "inertia": (value > 0, "> 0 [kg m^2]"),
         "radius": (value > 0, "> 0 [m]"),
         "half_extents": (value > 0, "> 0 [m]"),
-        "friction": (value >= 0, ">= 0"),
+        **{f: (value >= 0, ">= 0") for f in CONDIMS},
         "restitution": ((value >= 0) & (value <= 1), "in 0..1"),
-        "pair_friction": (value >= 0, ">= 0"),
+        **{"pair_" + f: (value >= 0, ">= 0") for f in CONDIMS},
         "pair_restitution": ((value >= 0) & (value <= 1), "in 0..1"),
     }
     ok, rule = rules.get(name, (np.ones_like(value, bool), "finite"))
@@ -226,8 +268,21 @@ def _check_number(name: str, value: np.ndarray) -> None:
 
 
 @struct
+class Coefficient:
+    """A coefficient of the geoms of both sides, and the values that pairs have of their own: (k, 1 or B)."""
+
+    a: jax.Array
+    b: jax.Array
+    own: jax.Array | None
+
+
+@struct
 class GroupParams:
-    """Numbers of one group, (P, 1) or (P, B). Poses are in the frame of their body or the world."""
+    """Numbers of one group, (P, 1) or (P, B). Poses are in the frame of their body or the world.
+
+    Of a group with a ``Choice`` they are those of its geoms: sizes and poses (k, 1 or B), every coefficient a
+    ``Coefficient``, the law one entry for each that differs.
+    """
 
     size_a: tuple
     size_b: tuple
@@ -236,6 +291,8 @@ class GroupParams:
     mu: jax.Array | None
     e: jax.Array | None
     law: object
+    mu_spin: jax.Array | None = None
+    mu_roll: jax.Array | None = None
 
 
 @struct
@@ -390,19 +447,21 @@ def _group_params(model: Model, g: Group, number: int, get, batch) -> GroupParam
 
     cat_a = "dynamic" if g.category == "dynamic" or g.flip else g.category
     cat_b = "dynamic" if g.category == "dynamic" or not g.flip else g.category
-    size_a, local_a = side(g.kind[0], g.a, g.body_a, cat_a == "dynamic", cat_a)
-    size_b, local_b = side(g.kind[1], g.b, g.body_b, cat_b == "dynamic", cat_b)
+    listed = g.choice or g
+    size_a, local_a = side(g.kind[0], listed.a, listed.body_a, cat_a == "dynamic", cat_a)
+    size_b, local_b = side(g.kind[1], listed.b, listed.body_b, cat_b == "dynamic", cat_b)
 
-    def combined(name: str, used: bool):
+    def combined(name: str, used: bool, a: np.ndarray, b: np.ndarray):
         """Larger of the two geoms, then the pair's own value."""
         if not used:
             return None
         values = get(name)
-        if values is None:
-            value = jnp.zeros((len(g.a), 1), model.mass.dtype)
-        else:
-            value = jnp.maximum(values[g.a], values[g.b])
         own = get("pair_" + name)
+        if values is None:
+            values = jnp.zeros((len(s.kinds), 1), model.mass.dtype)
+        if g.choice is not None:
+            return Coefficient(values[listed.a], values[listed.b], own if len(g.choice.override_keys) else None)
+        value = jnp.maximum(values[a], values[b])
         if own is None:
             return value
         rows = g.override
@@ -417,7 +476,9 @@ def _group_params(model: Model, g: Group, number: int, get, batch) -> GroupParam
         size_b,
         local_a,
         local_b,
-        combined("friction", g.friction),
-        combined("restitution", g.restitution),
+        combined("friction", g.friction, g.source_a, g.source_b),
+        combined("restitution", g.restitution, g.a, g.b),
         law,
+        combined("torsional_friction", g.torsion, g.source_a, g.source_b),
+        combined("rolling_friction", g.rolling, g.source_a, g.source_b),
     )

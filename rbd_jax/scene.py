@@ -28,6 +28,10 @@ CATEGORIES = ("dynamic", "kinematic", "static")
 
 DYNAMIC, KINEMATIC, STATIC = range(3)
 
+#: Coefficients of friction in the order in which a contact gains them, with the contact dimension (MuJoCo's
+#: condim) from which each acts: sliding, torsion about the normal, rolling about the tangents.
+CONDIMS = {"friction": 3, "torsional_friction": 4, "rolling_friction": 6}
+
 
 class _Unset(enum.Enum):
     UNSET = "unset"
@@ -64,7 +68,14 @@ class Geom:
       margin: distance at which a contact becomes active in the ``"mujoco"`` method [m]; the margins of a pair add.
       solref: MuJoCo's (time constant [s], damping ratio), or (-stiffness, -damping), of that method.
       solimp: MuJoCo's impedance (dmin, dmax, width [m], midpoint, power), of that method.
-      condim: 3, or 1. A pair has friction if either geom has friction and condim 3 (MuJoCo's larger condim).
+      condim: contact dimension the geom asks for: 1 frictionless, 3 sliding, 4 and torsional, 6 and rolling friction.
+        ``None`` follows from the coefficients given; a smaller number leaves those beyond it to partners that ask
+        for more. A pair has the larger condim and the larger of each coefficient, as in MuJoCo.
+      torsional_friction: coefficient of friction against spin about the normal [m], >= 0: the couple is at most
+        this times the normal force. ``None`` is absent; needs ``friction``. So far the ``"mujoco"`` method only.
+      rolling_friction: the same against rolling, about the tangents [m]; needs ``torsional_friction``.
+      priority: of two geoms that differ in it, the higher one alone gives condim, friction (all three coefficients),
+        solref and solimp of the pair, as in MuJoCo; restitution and margin combine as ever.
     """
 
     shape: Shape
@@ -78,7 +89,10 @@ class Geom:
     margin: float = 0.0
     solref: Any = (0.02, 1.0)
     solimp: Any = (0.9, 0.95, 0.001, 0.5, 2.0)
-    condim: int = 3
+    condim: int | None = None
+    torsional_friction: float | None = None
+    rolling_friction: float | None = None
+    priority: int = 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,7 +118,8 @@ class Body:
       density: of all geoms [kg/m^3].
       com: centre of mass in the body frame [m]; ``None`` takes it from the geoms.
       inertia: about the centre of mass in body axes, 3 or 3x3 [kg m^2]; needs ``mass``.
-      friction: shorthand that replaces the friction of all geoms (``None``: frictionless).
+      friction: shorthand that replaces the friction of all geoms (``None``: frictionless, without torsional or
+        rolling friction either).
       restitution: shorthand that replaces the restitution of all geoms (``None``: absent).
     """
 
@@ -175,9 +190,11 @@ class Pair:
     Attributes:
       a, b: names; a geom, or a body for all its geoms.
       friction: coefficient [-]; ``None`` is frictionless; ``UNSET`` combines the two geoms (larger value).
+      torsional_friction, rolling_friction: coefficients [m], likewise.
       restitution: coefficient [-]; ``None`` is absent; ``UNSET`` combines the two geoms (larger value).
       exclude: the two never collide.
-      solref, solimp, margin, condim: as in ``Geom``, of the pair; ``None`` combines the two geoms.
+      solref, solimp, margin: as in ``Geom``, of the pair; ``None`` combines the two geoms.
+      condim: contact dimension; ``None`` follows from the coefficients of the pair and the two geoms.
     """
 
     a: str
@@ -189,6 +206,8 @@ class Pair:
     solimp: Any = None
     margin: float | None = None
     condim: int | None = None
+    torsional_friction: Any = UNSET
+    rolling_friction: Any = UNSET
 
     def __post_init__(self):
         for field in ("a", "b"):
@@ -197,6 +216,9 @@ class Pair:
         who = f"pair ('{self.a}', '{self.b}')"
         put = _setter(self)
         put("friction", _friction(self.friction, who, UNSET))
+        for field in ("torsional_friction", "rolling_friction"):
+            put(field, _length_of_friction(getattr(self, field), who, field, UNSET))
+        _check_nested(self, who)
         put("restitution", _restitution(self.restitution, who, UNSET))
         put("solref", None if self.solref is None else _solref(self.solref, who))
         put("solimp", None if self.solimp is None else _solimp(self.solimp, who))
@@ -204,8 +226,8 @@ class Pair:
         put("condim", None if self.condim is None else _condim(self.condim, who))
         if not isinstance(self.exclude, (bool, np.bool_)):
             raise TypeError(f"{who}: exclude = {self.exclude!r} must be True or False")
-        given = (self.friction, self.restitution, self.solref, self.solimp, self.margin, self.condim)
-        if self.exclude and given != (UNSET, UNSET, None, None, None, None):
+        given = [f.name for f in dataclasses.fields(self)[2:] if getattr(self, f.name) != f.default]
+        if self.exclude and given != ["exclude"]:
             raise ValueError(f"{who}: exclude = True leaves no contact to set friction, restitution, ... of")
 
 
@@ -276,7 +298,8 @@ class Scene:
         _check_unique([g.name for g in owned + list(self.static) if g.name is not None], "geom")
         for body in self.bodies:
             _check_dynamic(body)
-        _find_pairs(self, _geom_table(self))
+        table = _geom_table(self)
+        _check_pair_condims(table, *_find_pairs(self, table))
 
 
 # ---------------------------------------------------------------------------------------------------------
@@ -297,11 +320,14 @@ def check_geom(geom: Shape | Geom, owner: str) -> Geom:
     if geom.name == "":
         raise ValueError(f"{owner}: name = '' must not be empty")
     geom.shape.check(owner)
+    _check_nested(geom, owner)
     return Geom(
         shape=geom.shape,
         pos=_vector(geom.pos, 3, owner, "pos", "[m]"),
         quat=_unit(geom.quat, owner),
         friction=_friction(geom.friction, owner),
+        torsional_friction=_length_of_friction(geom.torsional_friction, owner, "torsional_friction"),
+        rolling_friction=_length_of_friction(geom.rolling_friction, owner, "rolling_friction"),
         restitution=_restitution(geom.restitution, owner),
         group=_integer(geom.group, -(2**31), 2**31 - 1, owner, "group"),
         mask=_integer(geom.mask, -(2**31), 2**31 - 1, owner, "mask"),
@@ -309,7 +335,8 @@ def check_geom(geom: Shape | Geom, owner: str) -> Geom:
         margin=_nonnegative(geom.margin, owner, "margin", "[m]"),
         solref=_solref(geom.solref, owner),
         solimp=_solimp(geom.solimp, owner),
-        condim=_condim(geom.condim, owner),
+        condim=_geom_condim(geom, owner),
+        priority=_integer(geom.priority, -(2**31), 2**31 - 1, owner, "priority"),
     )
 
 
@@ -367,6 +394,21 @@ def _friction(value, who, *also):
     if value is None or any(value is a for a in also):
         return value
     return _nonnegative(value, who, "friction", "[-]")
+
+
+def _length_of_friction(value, who, field, *also):
+    if value is None or any(value is a for a in also):
+        return value
+    return _nonnegative(value, who, field, "[m]")
+
+
+def _check_nested(owner, who):
+    """Each coefficient of friction needs those before it: a contact gains them in this order."""
+    fields = list(CONDIMS)
+    for before, field in zip(fields, fields[1:]):
+        value = getattr(owner, field)
+        if value is not None and value is not UNSET and getattr(owner, before) is None:
+            raise ValueError(f"{who}: {field} = {value} needs {before} (0.0 is a value), not None")
 
 
 def _restitution(value, who, *also):
@@ -459,9 +501,21 @@ def _solimp(value, who):
 
 def _condim(value, who):
     v = _integer(value, 1, 6, who, "condim")
-    if v not in (1, 3):
-        raise ValueError(f"{who}: condim = {v} must be 1 or 3 (no torsional or rolling friction)")
+    if v not in (1, *CONDIMS.values()):
+        raise ValueError(f"{who}: condim = {v} must be 1, 3, 4 or 6")
     return v
+
+
+def _geom_condim(geom, who):
+    """None where the number says no more than the coefficients do, so that equal geoms compare equal."""
+    if geom.condim is None:
+        return None
+    v = _condim(geom.condim, who)
+    given = max([3, *(d for f, d in CONDIMS.items() if getattr(geom, f) is not None)])
+    for field, least in CONDIMS.items():
+        if least > 3 and v >= least > given:
+            raise ValueError(f"{who}: condim = {v} needs {field} (0.0 is a value), not None")
+    return v if v < given else None
 
 
 def _integer(value, low, high, who, field):
@@ -539,6 +593,8 @@ class ResolvedScene:
       geom_quat: (g, 4).
       geom_friction: (g,) [-].
       geom_has_friction: (g,) bool: not ``None``.
+      geom_torsional_friction, geom_rolling_friction: (g,) [m].
+      geom_has_torsional_friction, geom_has_rolling_friction: (g,) bool.
       geom_restitution: (g,) [-].
       geom_has_restitution: (g,) bool.
       geom_group: (g,) int64.
@@ -546,7 +602,8 @@ class ResolvedScene:
       geom_margin: (g,) [m].
       geom_solref: (g, 2).
       geom_solimp: (g, 5).
-      geom_condim: (g,) 1 or 3; 1 for a geom without friction.
+      geom_condim: (g,) 1, 3, 4 or 6; 1 for a geom without friction.
+      geom_priority: (g,) int64.
       pairs: (p, 2) geom indices, first < second, sorted; at least one side is dynamic.
       overrides: row of ``pairs`` -> the ``Pair`` that holds there.
     """
@@ -577,6 +634,10 @@ class ResolvedScene:
     geom_quat: np.ndarray
     geom_friction: np.ndarray
     geom_has_friction: np.ndarray
+    geom_torsional_friction: np.ndarray
+    geom_has_torsional_friction: np.ndarray
+    geom_rolling_friction: np.ndarray
+    geom_has_rolling_friction: np.ndarray
     geom_restitution: np.ndarray
     geom_has_restitution: np.ndarray
     geom_group: np.ndarray
@@ -585,25 +646,44 @@ class ResolvedScene:
     geom_solref: np.ndarray
     geom_solimp: np.ndarray
     geom_condim: np.ndarray
+    geom_priority: np.ndarray
     pairs: np.ndarray
     overrides: dict[int, Pair]
+
+    def pair_sources(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return (p,) and (p,) geoms whose surfaces combine: those of the pair, or twice the one of higher priority."""
+        return _sources(self.pairs, self.geom_priority)
+
+    def pair_condim(self) -> np.ndarray:
+        """Return (p,) contact dimensions 1, 3, 4 or 6: the larger of both geoms', or what the override gives."""
+        has = {f: getattr(self, "geom_has_" + f) for f in CONDIMS}
+        return _pair_condims(self.pair_sources(), self.geom_condim, has, self.overrides)
+
+    def _pair_coefficient(self, field: str) -> tuple[np.ndarray, np.ndarray]:
+        a, b = self.pair_sources()
+        values = getattr(self, "geom_" + field)
+        value = np.maximum(values[a], values[b])
+        for row, pair in self.overrides.items():
+            own = getattr(pair, field)
+            if own is not UNSET:
+                value[row] = own or 0.0
+        has = self.pair_condim() >= CONDIMS[field]
+        return np.where(has, value, 0.0), has
 
     def pair_friction(self) -> tuple[np.ndarray, np.ndarray]:
         """Return (p,) friction [-] and (p,) bool whether there is any: the larger value, or the override's.
 
         As in MuJoCo the pair is frictionless when the larger condim is 1.
         """
-        a, b = self.pairs.T
-        value = np.maximum(self.geom_friction[a], self.geom_friction[b])
-        has = np.maximum(self.geom_condim[a], self.geom_condim[b]) == 3
-        for row, pair in self.overrides.items():
-            if pair.friction is not UNSET:
-                value[row] = 0.0 if pair.friction is None else pair.friction
-                has[row] = pair.friction is not None
-            if pair.condim is not None:
-                given = self.geom_has_friction[self.pairs[row]].any() if pair.friction is UNSET else has[row]
-                has[row] = pair.condim == 3 and given
-        return np.where(has, value, 0.0), has
+        return self._pair_coefficient("friction")
+
+    def pair_torsional_friction(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return (p,) torsional friction [m] and (p,) bool whether there is any (condim 4 or 6)."""
+        return self._pair_coefficient("torsional_friction")
+
+    def pair_rolling_friction(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return (p,) rolling friction [m] and (p,) bool whether there is any (condim 6)."""
+        return self._pair_coefficient("rolling_friction")
 
     def pair_restitution(self) -> tuple[np.ndarray, np.ndarray]:
         """Return (p,) restitution [-] and (p,) bool whether there is any: the larger value, or the override's."""
@@ -622,8 +702,8 @@ class ResolvedScene:
         Margins add; solref and solimp are averaged, but solref is the smaller of each entry if one is in the
         direct (non-positive) format.
         """
-        a, b = self.pairs.T
-        margin = self.geom_margin[a] + self.geom_margin[b]
+        margin = self.geom_margin[self.pairs].sum(axis=1)
+        a, b = self.pair_sources()
         ra, rb = self.geom_solref[a], self.geom_solref[b]
         direct = (ra[:, :1] <= 0) | (rb[:, :1] <= 0)
         solref = np.where(direct, np.minimum(ra, rb), 0.5 * ra + 0.5 * rb)
@@ -656,7 +736,6 @@ def resolve(scene: Scene) -> ResolvedScene:
     pairs, overrides = _find_pairs(scene, table)
     inertial = [mass_properties(b) for b in scene.bodies]
     geoms = table.geoms
-    condim = np.array([1 if g.friction is None else g.condim for g in geoms], dtype=np.int64)
     return ResolvedScene(
         scene=scene,
         body_names=tuple(b.name for b in scene.bodies),
@@ -672,8 +751,8 @@ def resolve(scene: Scene) -> ResolvedScene:
         geom_body=table.body,
         geom_pos=_rows([g.pos for g in geoms], 3),
         geom_quat=_rows([g.quat for g in geoms], 4),
-        geom_friction=np.array([g.friction or 0.0 for g in geoms]),
-        geom_has_friction=np.array([g.friction is not None for g in geoms], dtype=bool),
+        **{f"geom_{f}": np.array([getattr(g, f) or 0.0 for g in geoms]) for f in CONDIMS},
+        **{f"geom_has_{f}": has for f, has in _given(geoms).items()},
         geom_restitution=np.array([g.restitution or 0.0 for g in geoms]),
         geom_has_restitution=np.array([g.restitution is not None for g in geoms], dtype=bool),
         geom_group=table.group,
@@ -681,7 +760,8 @@ def resolve(scene: Scene) -> ResolvedScene:
         geom_margin=np.array([g.margin for g in geoms]),
         geom_solref=_rows([g.solref for g in geoms], 2),
         geom_solimp=_rows([g.solimp for g in geoms], 5),
-        geom_condim=condim,
+        geom_condim=_condims(geoms),
+        geom_priority=np.array([g.priority for g in geoms], dtype=np.int64),
         pairs=pairs,
         overrides=overrides,
     )
@@ -771,7 +851,9 @@ def _geom_table(scene):
     for cat, bodies in ((DYNAMIC, scene.bodies), (KINEMATIC, scene.kinematic)):
         for i, body in enumerate(bodies):
             for j, g in enumerate(body.geoms):
-                if body.friction is not UNSET:
+                if body.friction is None:
+                    g = dataclasses.replace(g, **dict.fromkeys(CONDIMS))
+                elif body.friction is not UNSET:
                     g = dataclasses.replace(g, friction=body.friction)
                 if body.restitution is not UNSET:
                     g = dataclasses.replace(g, restitution=body.restitution)
@@ -795,6 +877,62 @@ def _geom_table(scene):
     group, mask = [g.group for g in geoms], [g.mask for g in geoms]
     ints = [np.array(v, dtype=np.int64) for v in (category, owner, group, mask)]
     return _GeomTable(tuple(geoms), tuple(names), *ints)
+
+
+def _given(geoms):
+    """Whether each geom has each coefficient of friction."""
+    return {f: np.array([getattr(g, f) is not None for g in geoms], dtype=bool) for f in CONDIMS}
+
+
+def _condims(geoms):
+    """Contact dimension each geom asks for."""
+    most = lambda g: max([1, *(d for f, d in CONDIMS.items() if getattr(g, f) is not None)])
+    return np.array([most(g) if g.condim is None else min(g.condim, most(g)) for g in geoms], dtype=np.int64)
+
+
+def _sources(pairs, priority):
+    a, b = pairs.T
+    return np.where(priority[b] > priority[a], b, a), np.where(priority[a] > priority[b], a, b)
+
+
+def _pair_condims(sources, condim, has, overrides):
+    """(p,) contact dimensions.
+
+    A coefficient that the override gives is there, one that it gives as ``None`` is not; the others are there
+    where the geoms ask for them or, if the override gives a condim, where a geom has them at all. An override's
+    condim caps what acts.
+    """
+    a, b = sources
+    out = np.maximum(condim[a], condim[b])
+    for row, pair in overrides.items():
+        asked, dim = out[row], 1
+        for field, least in CONDIMS.items():
+            own = getattr(pair, field)
+            if own is not UNSET:
+                there = own is not None
+            else:
+                there = asked >= least if pair.condim is None else bool(has[field][[a[row], b[row]]].any())
+            if not there or (pair.condim is not None and pair.condim < least):
+                break
+            dim = least
+        out[row] = dim
+    return out
+
+
+def _check_pair_condims(table, pairs, overrides):
+    """An override that asks for torsional or rolling friction must be able to have it."""
+    if not overrides:
+        return
+    priority = np.array([g.priority for g in table.geoms])
+    dims = _pair_condims(_sources(pairs, priority), _condims(table.geoms), _given(table.geoms), overrides)
+    for row, pair in overrides.items():
+        wanted = {f: d for f, d in CONDIMS.items() if d > 3 and getattr(pair, f) not in (UNSET, None)}
+        least = pair.condim if pair.condim is not None else max(wanted.values(), default=1)
+        if dims[row] < least and least > 3:
+            lacks = next(f for f, d in CONDIMS.items() if d > dims[row])
+            what = f"condim = {pair.condim}" if pair.condim is not None else f"{max(wanted, key=wanted.get)} is given"
+            names = " and ".join(f"'{table.names[g]}'" for g in pairs[row])
+            raise ValueError(f"pair ('{pair.a}', '{pair.b}'): {what}, but neither it nor geoms {names} have {lacks}")
 
 
 def _find_pairs(scene, table):

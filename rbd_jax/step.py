@@ -16,10 +16,11 @@ import jax.numpy as jnp
 
 from .bodies import Bodies
 from .detect import detect
+from .events import advance_to_impacts
 from .model import Model, Params, params
 from .solvers.base import Problem, Solution
 from .solvers.restitution import normal_velocity, targets
-from .solvers.rows import Impulses, InverseInertia, Rows, add_rows, take, take_tree
+from .solvers.rows import Impulses, Rows, add_rows, inverse_inertia, spread, take, take_tree
 from .spatial import Vec3, components, qexp, where, zeros_like
 from .state import Kinematic, Memory, State, World, Wrench, to_hot, to_public
 from .status import Status
@@ -43,7 +44,8 @@ def with_memory(model: Model, state: State) -> State:
     for g in s.groups:
         shape = (g.slots, g.capacity or len(g.a))
         lam = zero(*shape)
-        contacts.append(Impulses(lam, lam, lam) if g.friction else Impulses(lam))
+        entries = 1 + 2 * g.friction + g.torsion + 2 * g.rolling
+        contacts.append(Impulses(*[lam] * entries))
         feature.append(jnp.full((*batch, shape[1]), -1, jnp.int32) if g.features else None)
         pairs.append(jnp.full((*batch, shape[1]), len(g.a), jnp.int32) if g.capacity else None)
     L = None
@@ -186,11 +188,17 @@ def _substep(model: Model, p: Params, world: World, wrench: Wrench | None) -> Wo
         return world._with(bodies=bodies, kinematic=_prescribed(p, world.kinematic))
     if model.method.solver.level == "force":
         return _force_step(model, p, world, wrench)
+    nominal = None
+    if model.method.events:
+        world, left = _to_impacts(model, p, world, wrench)
+        p, nominal = p._with(h=left), p.h
     old = world.bodies
-    contacts = detect(s, p, world, model.method.contact)
+    contacts = detect(s, p, world, model.method.contact.reach)
+    if nominal is not None:  # impulses are kept as those of a whole step
+        contacts = tuple(c._with(warm=jax.tree.map(lambda x: x * (p.h / nominal), c.warm)) for c in contacts)
     a, tau = acceleration(p, wrench, old)
     v, L = integrator.kick(old, a, tau, p.inertia, p.h)
-    problem = _problem(p, old, v, L, contacts)
+    problem = _problem(p, old, v, L, contacts)._with(contact=model.method.contact, nominal=nominal)
     solution = model.method.solver.solve(problem)
     if any(rows.e is not None and rows.slots > 1 for rows in problem.rows):
         solution = _passive(p, problem, solution)
@@ -220,10 +228,27 @@ def _substep(model: Model, p: Params, world: World, wrench: Wrench | None) -> Wo
     return _remember(world, bodies, p, contacts, solution, problem)
 
 
+def _to_impacts(model: Model, p: Params, world: World, wrench: Wrench | None) -> tuple[World, jax.Array]:
+    """Every world at its last impact of this step, and what is left of the step [s], (B,)."""
+    support = turn = zeros_like(world.bodies.v)
+    for c in detect(model.structure, p, world, model.method.contact.reach):
+        J = c.rows.n * c.warm.n
+        if c.warm.t1 is not None:
+            t1, t2 = c.rows.tangents
+            J = J + t1 * c.warm.t1 + t2 * c.warm.t2
+        slots = lambda v: v.map(lambda c: c.sum(axis=0))
+        support = spread(support, c.rows, slots(J))
+        if world.bodies.L is not None:
+            turn = _spread_sides(
+                turn, c.rows, slots(c.rows.rb.cross(J)), None if c.rows.a is None else slots(c.rows.ra.cross(J))
+            )
+    return advance_to_impacts(model, p, world, *acceleration(p, wrench, world.bodies), (support, turn))
+
+
 def _problem(p: Params, old: Bodies, v: Vec3, L: Vec3 | None, contacts) -> Problem:
     w0 = w = inverse = None
     if L is not None:
-        inverse = materialise(_inverse_inertia(p, old), p.one)
+        inverse = materialise(inverse_inertia(p.inertia, old.q), p.one)
         w0, w = inverse @ old.L, inverse @ L
     return Problem(
         rows=tuple(c.rows for c in contacts),
@@ -241,26 +266,21 @@ def _problem(p: Params, old: Bodies, v: Vec3, L: Vec3 | None, contacts) -> Probl
     )
 
 
-def _inverse_inertia(p: Params, bodies: Bodies) -> InverseInertia:
-    """R I^-1 R^T of every body."""
-    if p.inertia.isotropic:
-        return InverseInertia(1.0 / p.inertia.moments)
-    r = bodies.q.mat()
-    d = Vec3(*(1.0 / c for c in (p.inertia.moments.x, p.inertia.moments.y, p.inertia.moments.z)))
-    ax, bx, cx = r.a * d, r.b * d, r.c * d
-    return InverseInertia(ax.dot(r.a), bx.dot(r.b), cx.dot(r.c), ax.dot(r.b), ax.dot(r.c), bx.dot(r.c))
-
-
 def _remember(world: World, bodies: Bodies, p: Params, contacts, solution: Solution, problem: Problem) -> World:
     status = world.status
     for c in contacts:
         if c.overflow is not None:
             status = status | jnp.where(c.overflow, jnp.uint32(int(Status.CAPACITY)), jnp.uint32(0))
+    if solution.overflow is not None:
+        status = status | jnp.where(solution.overflow, jnp.uint32(int(Status.CAPACITY)), jnp.uint32(0))
     if solution.unconverged is not None:
         status = status | jnp.where(solution.unconverged, jnp.uint32(int(Status.NOT_CONVERGED)), jnp.uint32(0))
     lasting = solution.contacts
     if solution.warm:
         lasting = tuple(_marked(c.rows, lam, problem) for c, lam in zip(contacts, lasting))
+    if problem.nominal is not None:
+        whole = lambda lam: jax.tree.map(lambda c: c * jnp.where(lam.n < 0, 1.0, problem.nominal / problem.h), lam)
+        lasting = tuple(whole(lam) for lam in lasting)
     shape = lambda new, old: jax.tree.map(lambda a, b: jnp.broadcast_to(a, b.shape).astype(b.dtype), new, old)
     return world._with(
         bodies=bodies,
@@ -300,7 +320,7 @@ def _force_step(model: Model, p: Params, world: World, wrench: Wrench | None) ->
     record = []
 
     def force(bodies: Bodies):
-        contacts = detect(s, p, world._with(bodies=bodies), model.method.contact)
+        contacts = detect(s, p, world._with(bodies=bodies), model.method.contact.reach)
         a, tau = acceleration(p, wrench, bodies)
         v, L = bodies.v if a is None else bodies.v + a * p.h, bodies.L
         problem = _problem(p, bodies, v, L, contacts)
@@ -333,7 +353,7 @@ def _correction(p: Params, problem: Problem, solution: Solution, v0: Vec3, v1: V
     """
     push = zeros_like(v0)
     for rows, lam in zip(problem.rows, solution.contacts):
-        push = _spread(push, rows, rows.n * lam.n.sum(axis=0))
+        push = spread(push, rows, rows.n * lam.n.sum(axis=0))
     if solution.warm:
         push = materialise(push, p.one)
     s = push.dot(push)
@@ -341,16 +361,6 @@ def _correction(p: Params, problem: Problem, solution: Solution, v0: Vec3, v1: V
     d = (v0 - v1) * (0.5 * p.h)
     along = jnp.where(touched, push.dot(d) / jnp.where(touched, s, 1.0), 0.0)
     return d - push * along
-
-
-def _spread(total: Vec3, rows, values: Vec3) -> Vec3:
-    """``total`` (n, B) with pair values (P, B) added to body B and subtracted from body A."""
-
-    def side(total, index, sign):
-        return Vec3(*(add_rows(t, index, sign * v) for t, v in zip(components(total), components(values))))
-
-    total = side(total, rows.b, 1.0)
-    return total if rows.a is None else side(total, rows.a, -1.0)
 
 
 @struct
@@ -391,9 +401,9 @@ def _impacts(p: Params, problem: Problem, solution: Solution, v1: Vec3) -> _Impa
             t1, t2 = rows.tangents
             J = J + t1 * mine.t1 + t2 * mine.t2
         slots = lambda v: v.map(lambda c: c.sum(axis=0))
-        impulse = _spread(impulse, rows, slots(J))
+        impulse = spread(impulse, rows, slots(J))
         late = slots(J * at)
-        shift = _spread(shift, rows, late * -1.0)
+        shift = spread(shift, rows, late * -1.0)
         if not spin:
             continue
         both = lambda total, b, a: _spread_sides(total, rows, b, a)

@@ -14,7 +14,7 @@ DEFAULT_SOLIMP = (0.9, 0.95, 0.001, 0.5, 2.0)
 
 @dataclasses.dataclass(frozen=True)
 class GeomLaw:
-    """Contact numbers of one geom, MuJoCo's defaults; friction is the sliding coefficient."""
+    """Contact numbers of one geom, MuJoCo's defaults; friction is the sliding coefficient, the others are in [m]."""
 
     friction: float = 1.0
     solref: tuple[float, float] = DEFAULT_SOLREF
@@ -24,6 +24,8 @@ class GeomLaw:
     solmix: float = 1.0
     priority: int = 0
     condim: int = 3
+    torsional: float = 0.005
+    rolling: float = 0.0001
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,6 +39,8 @@ class PairLaw:
     gap: float
     condim: int
     solreffriction: tuple[float, float] = (0.0, 0.0)
+    torsional: float = 0.005
+    rolling: float = 0.0001
 
 
 def combine(geom_a: GeomLaw, geom_b: GeomLaw, override: dict | None = None) -> PairLaw:
@@ -52,7 +56,8 @@ def combine(geom_a: GeomLaw, geom_b: GeomLaw, override: dict | None = None) -> P
     margin, gap = geom_a.margin + geom_b.margin, geom_a.gap + geom_b.gap
     if geom_a.priority != geom_b.priority:
         g = geom_a if geom_a.priority > geom_b.priority else geom_b
-        law = PairLaw(g.friction, tuple(g.solref), tuple(g.solimp), margin, gap, g.condim)
+        more = {"torsional": g.torsional, "rolling": g.rolling}
+        law = PairLaw(g.friction, tuple(g.solref), tuple(g.solimp), margin, gap, g.condim, **more)
     else:
         m = _mix(geom_a.solmix, geom_b.solmix)
         a, b = (np.asarray(g.solref, float) for g in (geom_a, geom_b))
@@ -65,9 +70,13 @@ def combine(geom_a: GeomLaw, geom_b: GeomLaw, override: dict | None = None) -> P
             margin,
             gap,
             max(geom_a.condim, geom_b.condim),
+            torsional=max(geom_a.torsional, geom_b.torsional),
+            rolling=max(geom_a.rolling, geom_b.rolling),
         )
     law = dataclasses.replace(law, **(override or {}))
-    return dataclasses.replace(law, friction=max(law.friction, MIN_FRICTION))
+    return dataclasses.replace(
+        law, **{f: max(getattr(law, f), MIN_FRICTION) for f in ("friction", "torsional", "rolling")}
+    )
 
 
 def _mix(a: float, b: float) -> float:
@@ -88,7 +97,6 @@ def law_of_pairs(pairs, impratio: float = 1.0, refsafe: bool = True, dtype=None)
     if any(any(p.solreffriction) for p in pairs):
         rows = [p.solreffriction if any(p.solreffriction) else p.solref for p in pairs]
         friction = tuple(col(r[k] for r in rows) for k in range(2))
-    dims = {p.condim for p in pairs}
     return MujocoLaw(
         *solref,
         *solimp,
@@ -96,6 +104,6 @@ def law_of_pairs(pairs, impratio: float = 1.0, refsafe: bool = True, dtype=None)
         impratio=np.full((1, 1), impratio, dtype or float),
         timeconst_friction=friction[0],
         dampratio_friction=friction[1],
-        frictional=np.asarray([p.condim == 3 for p in pairs])[:, None] if len(dims) == 2 else None,
+        condim=np.asarray([p.condim for p in pairs])[:, None] if len({p.condim for p in pairs}) > 1 else None,
         refsafe=refsafe,
     )

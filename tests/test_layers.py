@@ -22,6 +22,7 @@ LAYER = {
     "method": 6,
     "model": 6,
     "detect": 7,
+    "events": 7,
     "step": 7,
     "build": 7,
     "rollout": 8,
@@ -37,6 +38,8 @@ LAYER = {
 WITHIN = {
     ("model", "method"),
     ("step", "detect"),
+    ("step", "events"),
+    ("events", "detect"),
     ("build", "step"),
     ("record", "view"),
     ("mjcf", "examples"),

@@ -43,15 +43,22 @@ def random_scene(seed):
 
     def surface():
         friction = pick(None, 0.0, abs(number()), 1.0)
+        spin = None if friction is None else pick(None, 0.0, abs(number()))
+        roll = None if spin is None else pick(None, 0.0, abs(number()))
+        most = 3 + (spin is not None) + 2 * (roll is not None)
         return {
             "friction": friction,
+            "torsional_friction": spin,
+            "rolling_friction": roll,
+            "priority": pick(0, 0, 1),
             "restitution": pick(None, 0.0, float(rng.random())),
             "group": int(rng.integers(0, 4)),
             "mask": int(rng.integers(0, 4)),
             "margin": pick(0.0, abs(number())),
             "solref": pick((0.02, 1.0), (abs(number()), abs(number())), (-abs(number()), -abs(number()))),
             "solimp": (float(rng.random()), float(rng.random()), abs(number()), float(rng.random()), 1 + abs(number())),
-            "condim": 3 if friction is None else pick(1, 3, 3),  # without friction it means nothing and comes back as 3
+            # without friction it means nothing and comes back as None
+            "condim": None if friction is None else pick(None, *(d for d in (1, 3, 4, 6) if d <= most)),
         }
 
     def geom(name=None, planes=False):
@@ -100,6 +107,7 @@ def random_scene(seed):
             Pair("body 0", "body 1", exclude=True),
             Pair("body 2", "static:1", exclude=True),
             Pair("body 1", "static:0", friction=pick(None, 0.0, abs(number())), restitution=pick(None, 0.25)),
+            Pair("body 3", "static:0", friction=0.5, torsional_friction=pick(0.0, 0.3, None)),
             Pair("body 3", "body 2", margin=abs(number()), solref=(abs(number()), 1.0)),
         ],
         gravity=pick(None, (0.0, 0.0, 0.0), vec()),
@@ -184,7 +192,9 @@ def test_exported_model_has_our_numbers(seed):
         assert np.allclose(velocity[3:], r.vel[i], rtol=0, atol=1e-12 * size)
     for g, name in enumerate(r.geom_names):
         k = m.geom(name).id
-        assert m.geom_friction[k, 0] == r.geom_friction[g] and m.geom_condim[k] == r.geom_condim[g]
+        three = (r.geom_friction[g], r.geom_torsional_friction[g], r.geom_rolling_friction[g])
+        assert tuple(m.geom_friction[k]) == three and m.geom_condim[k] == r.geom_condim[g]
+        assert m.geom_priority[k] == r.geom_priority[g]
         assert np.array_equal(m.geom_pos[k], r.geom_pos[g]) and np.array_equal(m.geom_quat[k], r.geom_quat[g])
     assert m.opt.timestep == scene.dt and m.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
 
@@ -210,16 +220,17 @@ def test_pairs_and_their_numbers_are_those_of_mujocos_contacts(seed):
     r = resolve(scene)
     m, d = compile_mujoco(scene)
     margin, solref, solimp = r.pair_softness()
-    mu, has = r.pair_friction()
+    coefficients = [v for v, _ in (r.pair_friction(), r.pair_torsional_friction(), r.pair_rolling_friction())]
+    condim = r.pair_condim()
     row = {frozenset(r.geom_names[g] for g in p): k for k, p in enumerate(r.pairs.tolist())}
     seen = set()
     for c in d.contact:
         names = frozenset(m.geom(int(g)).name for g in c.geom)
         k = row[names]
         seen.add(k)
-        assert c.dim == (3 if has[k] else 1)
-        if has[k]:
-            assert c.friction[0] == pytest.approx(max(mu[k], 1e-5), rel=1e-15)  # MuJoCo's least friction
+        assert c.dim == condim[k]
+        five = np.array([coefficients[i][k] for i in (0, 0, 1, 2, 2)])[: c.dim - 1]
+        assert np.allclose(c.friction[: c.dim - 1], np.maximum(five, 1e-5), rtol=1e-15)  # MuJoCo's least friction
         assert c.includemargin == pytest.approx(margin[k], rel=1e-14)
         assert np.allclose(c.solref, solref[k], rtol=1e-14) and np.allclose(c.solimp, solimp[k], rtol=1e-14)
     assert seen == set(row.values())
@@ -399,6 +410,33 @@ def friction_of(xml, **kwargs):
     return [float(v) if h else None for v, h in zip(mu, has)]
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_any_condim_friction_and_priority_combine_as_in_mujoco(seed):
+    rng = np.random.default_rng(seed)
+
+    def attributes():
+        friction = " ".join(str(rng.choice([0.0, 0.001, 0.02, 0.7])) for _ in range(3))
+        return f'size="1" condim="{rng.choice([1, 3, 4, 6])}" friction="{friction}" priority="{rng.choice([0, 0, 1])}"'
+
+    bodies = "".join(f"<body><freejoint/><geom {attributes()}/></body>" for _ in range(4))
+    xml = mjcf(f"<geom {attributes()}/>{bodies}<geom {attributes()}/>")
+    m = mujoco.MjModel.from_xml_string(xml)
+    d = mujoco.MjData(m)
+    mujoco.mj_forward(m, d)
+    scene = load_mjcf(xml)
+    r = resolve(scene)
+    ids = np.argsort(m.geom_bodyid == 0, kind="stable").tolist()  # ours come last where they are fixed
+    row = {frozenset(ids[g] for g in p): k for k, p in enumerate(r.pairs.tolist())}
+    assert len(row) == len(d.contact)
+    for c in d.contact:
+        k = row[frozenset(c.geom.tolist())]
+        ours = (r.pair_friction()[0], r.pair_torsional_friction()[0], r.pair_rolling_friction()[0])
+        for value, i, least in zip(ours, (0, 2, 3), (3, 4, 6)):
+            theirs = c.friction[i] if c.dim >= least else 0.0
+            assert value[k] == (theirs if theirs > 1e-5 else 0.0), (i, c.dim, c.friction)
+    assert load_mjcf(to_mjcf(scene)) == scene
+
+
 @pytest.mark.parametrize("kinds", [((1, 1), (3, 0.5)), ((1, 0.2), (3, 0.5)), ((1, 1), (1, 0.3)), ((3, 0), (3, 0)),
                                    ((1, 1), (3, 0)), ((3, 0), (3, 0.4)), ((1, 0), (3, 0))])  # fmt: skip
 def test_condim_and_friction_combine_as_in_mujoco(kinds):
@@ -456,6 +494,13 @@ def test_contact_pairs_and_exclusions():
     r = resolve(load_mjcf(xml))
     assert r.pairs.tolist() == [[0, 1], [1, 2]]
     assert friction_of(xml) == [None, 0.3] and r.pair_softness()[0].tolist() == [0.0, 0.1]
+    six = xml.replace('friction="0.3 0.3"', 'friction="0.3 0.3 0.04 0.002 0.002" condim="6"')
+    assert resolve(load_mjcf(six)).pair_rolling_friction()[0].tolist() == [0.0, 0.002]
+    assert resolve(load_mjcf(six)).pair_torsional_friction()[0].tolist() == [0.0, 0.04]
+    four = six.replace('condim="6"', 'condim="4"').replace("0.002 0.002", "0.002 0.1")
+    assert not resolve(load_mjcf(four)).pair_rolling_friction()[1].any()
+    with pytest.raises(ValueError, match="friction = 0.002 0.1 .anisotropic.; the last two must be equal"):
+        load_mjcf(four.replace('condim="4"', 'condim="6"'))
 
 
 def test_mocap_velocity_from_custom():
@@ -487,7 +532,7 @@ def test_all_refusals_at_once():
         <geom name="s" size="1" solmix="3" solref="0.1 1"/>
       </worldbody>
       <contact><pair name="p" geom1="g6" geom2="s" friction="0.3" solreffriction="0.1 1" gap="1"/>
-        <pair name="p4" geom1="can" geom2="s" condim="4"/></contact>
+        <pair name="p4" geom1="can" geom2="s" condim="6" friction="1 1 0.1 0.01 0.02"/></contact>
       <tendon><fixed name="cord"><joint joint="elbow" coef="1"/></fixed></tendon>
       <actuator><motor name="muscle" joint="elbow"/></actuator>
       <equality><weld name="glue" body1="free" body2="balloon"/></equality>
@@ -518,12 +563,9 @@ def test_all_refusals_at_once():
         "geom 'bone' (body 'arm'): capsule geom; only sphere, box and plane are simulated",
         "geom 'can' (body 'free'): cylinder geom",
         "geom 'egg' (body 'free'): ellipsoid geom",
-        "geom 'egg' (body 'free'): condim = 4 (torsional/rolling friction)",
-        "geom 'g6' (body 'balloon'): condim = 6 (torsional/rolling friction)",
         "geom 'g6' (body 'balloon'): gap = 0.1",
         "geom 'g6' (body 'balloon'): adhesion = 2",
         "geom 'g6' (body 'balloon'): surfacevel = 1",
-        "geom priority",
         "geom solmix",
         "tendon 'cord': not simulated",
         "actuator 'muscle': not simulated",
@@ -531,14 +573,14 @@ def test_all_refusals_at_once():
         "pair 'p': friction = 0.3 1 (anisotropic)",
         "pair 'p': solreffriction = 1",
         "pair 'p': gap = 1",
-        "pair 'p4': condim = 4 (torsional/rolling friction)",
+        "pair 'p4': friction = 0.01 0.02 (anisotropic); the last two must be equal",
         "custom numeric 'rbd_restitution:nobody': no geom named 'nobody'",
         "custom numeric 'rbd_speed': unknown name",
         "custom numeric 'rbd_vel:free': data = (1.0, 2.0) must have 3 entries",
         "custom text 'rbd_note': unknown name",
     ]:
         assert reason in text, reason
-    assert text.count("\n  - ") == 39 - 1
+    assert text.count("\n  - ") == 36 - 1
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from mujoco_pairs import GeomLaw, PairLaw, combine, law_of_pairs
 from rbd_jax.bodies import Inertia
 from rbd_jax.solvers import dense
 from rbd_jax.solvers.base import Problem
+from rbd_jax.solvers.laws import NearRigid
 from rbd_jax.solvers.mujoco import MujocoNewton
 from rbd_jax.solvers.newton import NewtonLagged
 from rbd_jax.solvers.rows import Impulses, Index, InverseInertia, Rows
@@ -93,7 +94,8 @@ def stack_rows(x, q, half, mu, margin=0.01):
 
 def no_warm(rows):
     z = jnp.zeros_like(rows.phi)
-    return Impulses(z) if rows.mu is None else Impulses(z, z, z)
+    entries = 1 + 2 * (rows.mu is not None) + (rows.mu_spin is not None) + 2 * (rows.mu_roll is not None)
+    return Impulses(*[z] * entries)
 
 
 def masked(live, tree):
@@ -254,8 +256,8 @@ def test_lagged_optimality():
         u = world_velocity(rows, v, w)
         live = np.asarray(rows.live)
         k = np.asarray(dense.inverse_mass(dense.contacts(rows, problem), problem))
-        r = solver.beta**2 / (4 * np.pi**2) * k * np.maximum(live.sum(0), 1)
-        vhat = np.minimum(-np.asarray(rows.phi) * 240, solver.push_speed)
+        r = NearRigid().beta ** 2 / (4 * np.pi**2) * k * np.maximum(live.sum(0), 1)
+        vhat = np.minimum(-np.asarray(rows.phi) * 240, NearRigid().push_speed)
         law = np.where(live, np.maximum((vhat - u[0]) / r, 0), 0)
         np.testing.assert_allclose(p.n, law, rtol=1e-7, atol=1e-8)
         # friction opposes the slip, whatever its bound
@@ -292,7 +294,7 @@ def column_overlap(solver, mass, h):
     mass = np.asarray(mass)
     load = np.cumsum(mass[::-1], axis=0)[::-1]
     w = 4 / mass + np.r_[0 * mass[:1], 4 / mass[:-1]]
-    return solver.beta**2 / (4 * np.pi**2) * w * load * GRAVITY * np.asarray(h) ** 2
+    return NearRigid().beta ** 2 / (4 * np.pi**2) * w * load * GRAVITY * np.asarray(h) ** 2
 
 
 def test_lagged_column_stands():
@@ -550,12 +552,13 @@ mujoco = pytest.importorskip("mujoco")
 OPTION = '<option cone="elliptic" jacobian="dense" solver="Newton" tolerance="0" iterations="100" {}/>'
 
 
-def random_scene(rng, touch=True):
+def random_scene(rng, touch=True, condims=(1, 3, 3)):
     """XML of a plane, a static box and four random bodies; ``touch``: piled up, else side by side."""
     u = rng.uniform
 
     def law():
-        s = f'friction="{u(0.1, 1.2):.3f} 0 0" condim="{rng.choice([1, 3, 3])}" solmix="{u(0.2, 3):.3f}" '
+        friction = f"{u(0.1, 1.2):.3f} {10 ** u(-4, -1):.6f} {10 ** u(-5, -2):.6f}"
+        s = f'friction="{friction}" condim="{rng.choice(condims)}" solmix="{u(0.2, 3):.3f}" '
         s += f'priority="{rng.choice([0, 0, 0, 1])}" '
         s += f'solimp="{u(0.6, 0.9):.3f} {u(0.9, 0.99):.3f} {u(0.002, 0.05):.4f} {u(0.2, 0.8):.2f} {u(1, 3):.2f}" '
         if rng.random() < 0.3:
@@ -592,12 +595,14 @@ def geom_law(m, g):
         solmix=m.geom_solmix[g],
         priority=int(m.geom_priority[g]),
         condim=int(m.geom_condim[g]),
+        torsional=m.geom_friction[g, 1],
+        rolling=m.geom_friction[g, 2],
     )
 
 
-def mujoco_problem(m, d, pairs=(12, 24), dtype=jnp.float64):
+def mujoco_problem(m, d, pairs=(12, 24), dtype=jnp.float64, angular_rows=False):
     """One-world Problem of MuJoCo's own contact list, padded to (static, dynamic) pairs of bodies
-    given by arrays, and the contact numbers of every group."""
+    given by arrays, and the contact numbers of every group; ``angular_rows``: with torsional and rolling friction."""
     n = m.nbody - 1
     arr = lambda a: Vec3(*(jnp.asarray(np.asarray(a)[:, k : k + 1], dtype) for k in range(3)))
     quat = np.zeros((n, 4))  # of the principal frame
@@ -628,7 +633,11 @@ def mujoco_problem(m, d, pairs=(12, 24), dtype=jnp.float64):
         laws = [combine(*(geom_law(m, g) for g in c.geom)) for c in cs]
         laws += [PairLaw(1.0, (0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0), 0.0, 0.0, 3)] * pad
         law = jax.tree.map(lambda x: jnp.asarray(x, dtype), law_of_pairs(laws, impratio=m.opt.impratio))
-        law = law._with(frictional=jnp.asarray([[p.condim == 3] for p in laws]))
+        law = law._with(condim=jnp.asarray([[p.condim] for p in laws]))
+        angular = {}
+        if angular_rows:
+            angular = {f"mu_{k}": jnp.asarray([[v] for v in c], dtype) for k, c in (
+                ("spin", [p.torsional for p in laws]), ("roll", [p.rolling for p in laws]))}  # fmt: skip
         slot = lambda v: jax.tree.map(lambda leaf: leaf[None], arr(v))
         rows.append(
             Rows(
@@ -641,6 +650,7 @@ def mujoco_problem(m, d, pairs=(12, 24), dtype=jnp.float64):
                 ra=slot(pos - d.xipos[a + 1]) if dynamic else None,
                 a=jnp.asarray(a)[:, None] if dynamic else None,
                 mu=jnp.asarray([[p.friction] for p in laws], dtype),
+                **angular,
             )
         )
     state = (arr(d.xipos[1:]), q, arr(vel), arr(omega))
@@ -699,15 +709,16 @@ def assert_same_forces(cases, problem, solution, ids_of):
         np.testing.assert_allclose(got, want, atol=1e-8 * max(1.0, np.abs(want).max()))
 
 
+@pytest.mark.parametrize("condims", [(1, 3, 3), (1, 3, 4, 6)], ids=["sliding", "torsion and rolling"])
 @pytest.mark.parametrize("bodies_touch", [True, False])
-def test_mujoco_forces(bodies_touch):
+def test_mujoco_forces(bodies_touch, condims):
     """Random spheres and boxes, contact by contact, against ``mj_forward`` (MuJoCo 4.0.1)."""
     cases, problems, ids = [], [], []
     for seed in range(48 if bodies_touch else 24):
         rng = np.random.default_rng(seed)
-        xml, pairs = random_scene(rng, bodies_touch), (32, 48 if bodies_touch else 0)
+        xml, pairs = random_scene(rng, bodies_touch, condims), (32, 48 if bodies_touch else 0)
         m, d = mujoco_state(rng, xml)
-        problem, group = mujoco_problem(m, d, pairs)
+        problem, group = mujoco_problem(m, d, pairs, angular_rows=6 in condims)
         cases.append((m, d)), problems.append(problem), ids.append(group)
     problem = batch_problems(problems)
     solution = jax.jit(MujocoNewton().solve)(problem)
@@ -723,13 +734,14 @@ def test_mujoco_law_numbers():
     seen = set()
     for seed in range(12):
         rng = np.random.default_rng(100 + seed)
-        m, d = mujoco_state(rng, random_scene(rng))
-        problem, ids = mujoco_problem(m, d, (32, 48))
+        m, d = mujoco_state(rng, random_scene(rng, condims=(1, 1, 1, 3, 4, 6)))
+        problem, ids = mujoco_problem(m, d, (32, 48), angular_rows=True)
         for rows, group in zip(problem.rows, ids):
             law = module._law(dense.contacts(rows, problem), rows, problem)
             for k, c in enumerate(d.contact[i] for i in group):
                 pair = combine(*(geom_law(m, g) for g in c.geom))
-                assert pair.condim == c.dim and pair.friction == pytest.approx(c.friction[0], abs=1e-15)
+                five = [pair.friction] * 2 + [pair.torsional] + [pair.rolling] * 2
+                assert pair.condim == c.dim and five == pytest.approx(c.friction, abs=1e-15)
                 assert pair.margin == pytest.approx(c.includemargin, abs=1e-15)
                 np.testing.assert_allclose(pair.solref, c.solref, rtol=1e-14)
                 np.testing.assert_allclose(pair.solimp, c.solimp, rtol=1e-14)
@@ -737,10 +749,10 @@ def test_mujoco_law_numbers():
                 np.testing.assert_allclose(law.dn[0, k, 0], d.efc_D[row], rtol=1e-10)
                 reference = np.asarray(law.reference.n[0, k, 0]) / m.opt.timestep
                 np.testing.assert_allclose(reference, d.efc_aref[row], rtol=1e-9, atol=1e-9)
-                if c.dim == 3:
-                    np.testing.assert_allclose(law.dt[0, k, 0], d.efc_D[row + 1], rtol=1e-10)
+                stiffness = [law.dt, law.dt, law.ds, law.dr, law.dr][: c.dim - 1]
+                np.testing.assert_allclose([x[0, k, 0] for x in stiffness], d.efc_D[row + 1 : row + c.dim], rtol=1e-10)
                 seen.add((c.dim, bool(c.solref[0] > 0)))
-    assert len(seen) == 4  # both dimensions, both formats of solref
+    assert len(seen) == 8  # all dimensions, both formats of solref
     assert combine(GeomLaw(), GeomLaw(), {"friction": 0.3}).friction == 0.3
     with pytest.raises(ValueError, match="unknown fields"):
         combine(GeomLaw(), GeomLaw(), {"fiction": 0.3})

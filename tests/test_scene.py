@@ -69,7 +69,23 @@ BAD = [
     (geom(restitution=NAN), "body 'ball': restitution = nan must be between 0 and 1 [-]"),
     (geom(quat=(0, 0, 0, 0)), "body 'ball': quat = (0.0, 0.0, 0.0, 0.0) must not be zero"),
     (geom(margin=-1), "body 'ball': margin = -1.0 must be finite and >= 0 [m]"),
-    (geom(condim=6), "body 'ball': condim = 6 must be 1 or 3"),
+    (geom(condim=5), "body 'ball': condim = 5 must be 1, 3, 4 or 6"),
+    (geom(condim=4), "body 'ball': condim = 4 needs torsional_friction"),
+    (geom(torsional_friction=0.1, condim=6), "body 'ball': condim = 6 needs rolling_friction"),
+    (geom(torsional_friction=-1), "body 'ball': torsional_friction = -1.0 must be finite and >= 0 [m]"),
+    (geom(torsional_friction=1, rolling_friction=float("nan")), "rolling_friction = nan must be finite and >= 0 [m]"),
+    (geom(friction=None, torsional_friction=0.1), "torsional_friction = 0.1 needs friction (0.0 is a value), not None"),
+    (geom(rolling_friction=0.1), "body 'ball': rolling_friction = 0.1 needs torsional_friction"),
+    (lambda: Pair("a", "b", friction=None, torsional_friction=0.1), "pair ('a', 'b'): torsional_friction = 0.1 needs"),
+    (lambda: Pair("a", "b", torsional_friction=0.1, exclude=True), "exclude = True leaves no contact"),
+    (
+        scene(pairs=[Pair("ball", "static:0", condim=4)], static=[Plane()]),
+        "condim = 4, but neither it nor geoms 'ball' and 'static:0' have torsional_friction",
+    ),
+    (
+        scene(pairs=[Pair("ball", "static:0", rolling_friction=0.1)], static=[Plane()]),
+        "rolling_friction is given, but neither it nor geoms 'ball' and 'static:0' have torsional_friction",
+    ),
     (geom(solref=(0.02, -1)), "solref = (0.02, -1.0) must be (time constant, damping ratio)"),
     (geom(solimp=(0.9, 0.95, 0.001, 0.5)), "solimp = (0.9, 0.95, 0.001, 0.5) must have 5 entries"),
     (geom(solimp=(0.9, 1.95, 0.001, 0.5, 2)), "must be (dmin, dmax, width, midpoint, power)"),
@@ -304,6 +320,42 @@ def test_overrides():
     r = resolve(Scene([Body("a", Geom(Sphere(1), solref=(-5, -1), margin=0.1))], static=Geom(Plane(), margin=0.2)))
     margin, solref, solimp = r.pair_softness()
     assert margin[0] == pytest.approx(0.3) and solref.tolist() == [[-5, -1]] and solimp[0, 0] == 0.9
+
+
+def _turning(*pairs, a, b):
+    """condim and the three coefficients of the pair of a ball and a floor."""
+    floor = Geom(Plane(), name="floor", **b)
+    r = resolve(Scene([Body("ball", Geom(Sphere(1), **a))], static=[floor], pairs=pairs))
+    found = (r.pair_friction(), r.pair_torsional_friction(), r.pair_rolling_friction())
+    return int(r.pair_condim()[0]), *(float(v[0]) if has[0] else None for v, has in found)
+
+
+def test_torsional_and_rolling_friction_combine():
+    three, four = dict(friction=0.3), dict(friction=0.2, torsional_friction=0.01)
+    six = dict(four, rolling_friction=0.001)
+    hidden = dict(six, torsional_friction=0.05, condim=3)  # has them, asks for none
+    assert _turning(a=four, b=three) == (4, 0.3, 0.01, None)
+    assert _turning(a=six, b=four) == (6, 0.2, 0.01, 0.001)
+    assert _turning(a=hidden, b=three) == (3, 0.3, None, None)
+    assert _turning(a=hidden, b=four) == (4, 0.2, 0.05, None)
+    assert _turning(a=dict(friction=None), b=four) == (4, 0.2, 0.01, None)
+    # of different priority the higher one alone
+    assert _turning(a=dict(three, priority=1), b=six) == (3, 0.3, None, None)
+    assert _turning(a=dict(six, priority=-1), b=four) == (4, 0.2, 0.01, None)
+    # overrides
+    pair = lambda **k: Pair("ball", "floor", **k)
+    assert _turning(pair(torsional_friction=0.5), a=three, b=three) == (4, 0.3, 0.5, None)
+    assert _turning(pair(torsional_friction=None), a=six, b=six) == (3, 0.2, None, None)
+    assert _turning(pair(rolling_friction=0.0), a=four, b=three) == (6, 0.3, 0.01, 0.0)
+    assert _turning(pair(friction=None), a=six, b=six) == (1, None, None, None)
+    assert _turning(pair(condim=6), a=hidden, b=three) == (6, 0.3, 0.05, 0.001)
+    assert _turning(pair(condim=4), a=six, b=six) == (4, 0.2, 0.01, None)
+    assert _turning(pair(condim=3, torsional_friction=0.5), a=three, b=three) == (3, 0.3, None, None)
+    # a body without friction has none of it
+    frictionless = Body("b", Geom(Sphere(1), **six), friction=None)
+    assert resolve(Scene([frictionless])).geom_condim.tolist() == [1]
+    assert Geom(Sphere(1), **six) != Geom(Sphere(1), **six, condim=4)
+    assert Body("b", Geom(Sphere(1), **six, condim=6)) == Body("b", Geom(Sphere(1), **six))
 
 
 def test_exclusion_and_precedence():

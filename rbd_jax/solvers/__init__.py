@@ -1,11 +1,28 @@
 """Layer 5: contact solvers by name."""
 
 from .base import Problem, Solution, Solver
+from .laws import CONTACT_MODELS, ContactModel
 from .mujoco import MujocoNewton
 from .newton import NewtonLagged
+from .penalty import Penalty
+from .pgs import PGS
 from .rows import Impulses, Rows
 from .tgs import TGS
 
-SOLVERS = {cls.name: cls for cls in (TGS, NewtonLagged, MujocoNewton)}
+SOLVERS = {cls.name: cls for cls in (TGS, PGS, NewtonLagged, MujocoNewton, Penalty)}
 
-__all__ = ["Impulses", "MujocoNewton", "NewtonLagged", "Problem", "Rows", "SOLVERS", "Solution", "Solver", "TGS"]
+__all__ = [
+    "CONTACT_MODELS",
+    "ContactModel",
+    "Impulses",
+    "MujocoNewton",
+    "NewtonLagged",
+    "PGS",
+    "Penalty",
+    "Problem",
+    "Rows",
+    "SOLVERS",
+    "Solution",
+    "Solver",
+    "TGS",
+]

@@ -23,8 +23,10 @@ class Problem:
       v, w: predicted velocities v* = v0 + h a, w* (all but the contact forces applied).
         w0 and w are None when the scene carries no attitude (then no row has an angular part).
       inv_mass: [1/kg]. inertia, q: principal inertia and attitude. inv_inertia: world R I^-1 R^T.
-      h: step [s], scalar or (B,).
+      h: step [s], scalar or (B,). nominal: the step over which overlap is resolved, where h is what impacts left
+        of it; None = h.
       warm: impulses to start from, one entry a group, already zero where a contact is new.
+      contact: the ``laws.ContactModel``, None = the solver's own.
       one: an array equal to 1 that XLA cannot see through, see ``rbd_jax.xla.materialise``.
     """
 
@@ -35,11 +37,13 @@ class Problem:
     h: jax.Array
     warm: tuple[Impulses, ...]
     one: jax.Array
+    nominal: jax.Array | None = None
     w0: Vec3 | None = None
     w: Vec3 | None = None
     q: Quat | None = None
     inertia: Inertia | None = None
     inv_inertia: InverseInertia | None = None
+    contact: object = static(default=None)
 
 
 @struct
@@ -53,6 +57,7 @@ class Solution:
       v_move, w_move: velocities that move the poses in this step where they differ from the
         end-of-step velocities (position bias), else None.
       unconverged: bool (B,) or None.
+      overflow: bool (B,), live contacts that found no place and were dropped; None = cannot happen.
       warm: whether the next step starts from these impulses (a closed form does not).
     """
 
@@ -62,6 +67,7 @@ class Solution:
     v_move: Vec3 | None = None
     w_move: Vec3 | None = None
     unconverged: jax.Array | None = None
+    overflow: jax.Array | None = None
     warm: bool = static(default=True)
 
 
@@ -70,8 +76,14 @@ class Solver:
     """A contact solver: a frozen (hashable, static) dataclass of its iteration counts and constants."""
 
     name: ClassVar[str]
-    #: contact model whose numbers it takes: "soft", "near_rigid" or "mujoco"
+    #: its contact model where the method names none
     contact: ClassVar[str]
+    #: the models it takes, None = any
+    models: ClassVar[tuple[str, ...] | None] = None
+    #: whether a step is better split than solved harder (``Method.substeps`` = None)
+    substeps: ClassVar[bool] = False
+    #: whether it has rows of torsional and rolling friction; ``build`` refuses scenes that need them where not
+    spins: ClassVar[bool] = False
     #: "velocity": solves for end-of-step velocities; "force": gives forces at the given state
     level: ClassVar[str] = "velocity"
 

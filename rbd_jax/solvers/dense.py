@@ -9,7 +9,9 @@ of a pair share: the sums over slots are done there and only their results are t
 
 Symbols: r arm in the contact frame; G 3x3 (``Sym3``); K = sum G, C = sum [r]x G, W = sum [r]x G [r]x'
 the force-velocity, torque-velocity and torque-spin blocks of a pair. Row vectors (velocities,
-impulses) are ``Impulses``: the entries t1 and t2 are None without friction.
+impulses) are ``Impulses``: the entries t1 and t2 are None without friction. Where a pair has angular rows
+(torsional and rolling friction) G is 6x6 (``Sym6``) with blocks F, X, T of force-velocity, force-spin and
+torque-spin, and K = sum F, C = sum [r]x F + X', W = sum [r]x F [r]x' + [r]x X + X' [r]x' + T.
 """
 
 from __future__ import annotations
@@ -48,11 +50,33 @@ class Sym3:
 
 
 @struct
+class Sym6:
+    """A symmetric matrix over the rows of force (n, t1, t2) and of torque (s, r1, r2) in the contact frame.
+
+    force: force to velocity. cross: row i, column j = force along axis i to spin about axis j, nested tuples with
+    structural zeros. torque: torque to spin. Axes x, y, z are t1, t2, n.
+    """
+
+    force: Sym3
+    cross: tuple
+    torque: Sym3
+
+    def __matmul__(self, u: Impulses) -> Impulses:
+        velocity, spin = (u.t1, u.t2, u.n), (u.r1, u.r2, u.s)
+        f = self.force @ Impulses(u.n, u.t1, u.t2)
+        t = self.torque @ Impulses(u.s, u.r1, u.r2)
+        f = [_add(x, *map(_mul, row, spin)) for x, row in zip((f.t1, f.t2, f.n), self.cross)]
+        t = [None if x is None else _add(x, *map(_mul, column, velocity))
+             for x, column in zip((t.t1, t.t2, t.n), zip(*self.cross))]  # fmt: skip
+        return Impulses(f[2], f[0], f[1], t[2], t[0], t[1])
+
+
+@struct
 class Contacts:
     """A group of rows in the contact frames of its pairs.
 
     n, t1, t2: the frame in world axes, (P, B). ra, rb: arms in the frame, (S, P, B), None without
-    attitude. a, b: as in ``Rows``.
+    attitude. a, b: as in ``Rows``. friction, torsion, rolling: which rows there are beside the normal one.
     """
 
     n: Vec3
@@ -64,6 +88,8 @@ class Contacts:
     rb: Vec3 | None = None
     ra: Vec3 | None = None
     friction: bool = static(default=True)
+    torsion: bool = static(default=False)
+    rolling: bool = static(default=False)
 
     def turn(self, v: Vec3) -> Vec3:
         """World components -> contact frame; the tangential ones are None where nothing uses them."""
@@ -90,14 +116,15 @@ def contacts(rows: Rows, problem: Problem) -> Contacts:
         arm = lambda r: materialise(Vec3(t1.dot(r), t2.dot(r), rows.n.dot(r)), problem.one)
         rb = arm(rows.rb)
         ra = None if rows.a is None else arm(rows.ra)
-    return Contacts(rows.n, t1, t2, rows.live, rows.b, rows.a, rb, ra, friction)
+    torsion, rolling = rows.mu_spin is not None, rows.mu_roll is not None
+    return Contacts(rows.n, t1, t2, rows.live, rows.b, rows.a, rb, ra, friction, torsion, rolling)
 
 
 # --- row vectors ---------------------------------------------------------------------------------
 
 
 def row_dot(p: Impulses, u: Impulses) -> jax.Array:
-    return _add(p.n * u.n, _mul(p.t1, u.t1), _mul(p.t2, u.t2))
+    return _add(p.n * u.n, _mul(p.t1, u.t1), _mul(p.t2, u.t2), _mul(p.s, u.s), _mul(p.r1, u.r1), _mul(p.r2, u.r2))
 
 
 def at_points(c: Contacts, v: Vec3, w: Vec3 | None) -> Impulses:
@@ -118,7 +145,35 @@ def at_points(c: Contacts, v: Vec3, w: Vec3 | None) -> Impulses:
         ua = side(c.a, c.ra)
         u = Vec3(*(None if p is None else p - q for p, q in zip((u.x, u.y, u.z), (ua.x, ua.y, ua.z))))
     full = lambda x: jnp.broadcast_to(x, jnp.broadcast_shapes(x.shape, c.live.shape))
-    return Impulses(full(u.z), full(u.x), full(u.y)) if c.friction else Impulses(full(u.z))
+    if not c.friction:
+        return Impulses(full(u.z))
+    return Impulses(full(u.z), full(u.x), full(u.y), *map(full, _angular(c, _relative_spin(c, w))))
+
+
+def _relative_spin(c: Contacts, w: Vec3 | None) -> Vec3 | None:
+    """wB - wA of every pair, (P, B) world axes; None where no row needs it."""
+    if not c.torsion:
+        return None
+    spin = take_tree(w, c.b)
+    return spin if c.a is None else spin - take_tree(w, c.a)
+
+
+def _angular(c: Contacts, spin: Vec3 | None) -> tuple:
+    """The angular entries (s, r1, r2) of ``Impulses`` that the group has, of an angular velocity of its pairs."""
+    if not c.torsion:
+        return ()
+    spin = c.turn(spin)
+    return (spin.z, spin.x, spin.y) if c.rolling else (spin.z,)
+
+
+def relative(c: Contacts, rows: Rows, v: Vec3, w: Vec3 | None) -> Impulses:
+    """Velocity of the points relative to the partner, which may move as prescribed."""
+    u = at_points(c, v, w)
+    if rows.surface is None:
+        return u
+    s = c.turn(rows.surface)
+    s = Impulses(s.z, s.x, s.y, *_angular(c, rows.surface_spin)) if c.friction else Impulses(s.z)
+    return jax.tree.map(jnp.subtract, u, s)
 
 
 def on_bodies(cs, ps, problem: Problem) -> tuple[Vec3, Vec3 | None]:
@@ -140,9 +195,9 @@ def on_bodies(cs, ps, problem: Problem) -> tuple[Vec3, Vec3 | None]:
             x, y = r.y * p.n, -r.x * p.n
             if c.friction:
                 x, y = x - r.z * p.t2, y + r.z * p.t1
-            turn = c.t1 * x.sum(0) + c.t2 * y.sum(0)
+            turn = c.t1 * _add(x, p.r1).sum(0) + c.t2 * _add(y, p.r2).sum(0)
             if c.friction:
-                turn = turn + c.n * (r.x * p.t2 - r.y * p.t1).sum(0)
+                turn = turn + c.n * _add(r.x * p.t2 - r.y * p.t1, p.s).sum(0)
             torque = _scatter(torque, index, turn * sign)
     return force, torque
 
@@ -275,7 +330,7 @@ def _coupled(cs, gs, rhs, problem: Problem):
     return Vec3(*x), rhs[1]
 
 
-def _pair_blocks(c: Contacts, g: Sym3, one, size: int):
+def _pair_blocks(c: Contacts, g: Sym3 | Sym6, one, size: int):
     """(body row, body column, size x size entries) of every block of J' G J of one group."""
     k, cb, wb = _diagonal_blocks(c, g, c.rb, one)
     yield c.b, c.b, _assemble(k, cb, wb, size)
@@ -305,34 +360,49 @@ def _assemble(k, c, w, size: int, upper=None):
     return m
 
 
-def _diagonal_blocks(c: Contacts, g: Sym3, r: Vec3 | None, one):
+def _diagonal_blocks(c: Contacts, g: Sym3 | Sym6, r: Vec3 | None, one):
     """K, C, W of one body of every pair, world axes, entries (P, B)."""
     if c.t1 is None:  # no tangents at all: K = G n n'
         gn = materialise(g.zz.sum(0), one)
         n = components(c.n)
         return [[n[i] * n[j] * gn for j in range(3)] for i in range(3)], None, None
     m = _full(g)
+    cross = g.cross if isinstance(g, Sym6) else _NONE
     k = _rotate(c, materialise([[None if x is None else x.sum(0) for x in row] for row in m], one), one)
     if r is None:
         return k, None, None
-    torque = [_cross(r, [m[i][j] for i in range(3)]) for j in range(3)]  # columns of [r]x G
-    cb = [[_slots(torque[j][i]) for j in range(3)] for i in range(3)]
+    torque = [_cross(r, [m[i][j] for i in range(3)]) for j in range(3)]  # columns of [r]x F
+    cb = [[_slots(_add(torque[j][i], cross[j][i])) for j in range(3)] for i in range(3)]
     return k, _rotate(c, materialise(cb, one), one), _rotate(c, _torque_spin(c, g, r, r, one), one)
 
 
-def _torque_spin(c: Contacts, g: Sym3, ra: Vec3, rb: Vec3, one):
-    """Sum of [ra]x G [rb]x' in the contact frame."""
+def _torque_spin(c: Contacts, g: Sym3 | Sym6, ra: Vec3, rb: Vec3, one):
+    """Sum of [ra]x F [rb]x' + [ra]x X + X' [rb]x' + T in the contact frame."""
     m = _full(g)
     torque = [_cross(ra, [m[i][j] for i in range(3)]) for j in range(3)]
-    w = [_cross(rb, [torque[j][i] for j in range(3)]) for i in range(3)]
-    return materialise([[_slots(x) for x in row] for row in w], one)
+    if not isinstance(g, Sym6):
+        w = [_cross(rb, [torque[j][i] for j in range(3)]) for i in range(3)]
+        return materialise([[_slots(x) for x in row] for row in w], one)
+    x, t = g.cross, _full3(g.torque)
+    # ([ra]x F + X') [rb]x' , then [ra]x X + T
+    w = [_cross(rb, [_add(torque[j][i], x[j][i]) for j in range(3)]) for i in range(3)]
+    arm = [_cross(ra, [x[i][j] for i in range(3)]) for j in range(3)]
+    return materialise([[_slots(_add(w[i][j], arm[j][i], t[i][j])) for j in range(3)] for i in range(3)], one)
 
 
 def _slots(x):
     return None if x is None else x.sum(0)
 
 
-def _full(g: Sym3):
+_NONE = ((None,) * 3,) * 3
+
+
+def _full(g: Sym3 | Sym6):
+    """The block F."""
+    return _full3(g.force if isinstance(g, Sym6) else g)
+
+
+def _full3(g: Sym3):
     return [[g.xx, g.xy, g.xz], [g.xy, g.yy, g.yz], [g.xz, g.yz, g.zz]]
 
 

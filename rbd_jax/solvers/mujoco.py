@@ -7,6 +7,9 @@ With j = J a - a_ref, mu' = mu / sqrt(impratio), D = 1/R, N = mu' j_n, T = mu |j
     mu' N + T <= 0    -D j_n, -D impratio j_t                             sticking
     else              f_n = D (mu' T - N) / (mu' (1 + mu'^2)), f_t = -mu f_n j_t / |j_t|    sliding
 
+With torsional and rolling friction T = |(mu_i j_i)| over all friction rows i (two of sliding, one about the normal, two
+about the tangents; mu_i in [m] for the last three), D_i = D impratio (mu_i / mu)^2, and f_i = -mu_i^2 f_n j_i / T.
+
 Everything is multiplied by the step h: velocities x = h j and impulses p = h f.
 
 Source: MuJoCo documentation, "Computation: solver"; compared with ``mj_forward`` of 4.0.1 (``tests/test_newton.py``).
@@ -30,7 +33,7 @@ from ..struct import struct
 from ..xla import materialise
 from . import dense
 from .base import Problem, Solution, Solver
-from .dense import Contacts, Sym3
+from .dense import Contacts, Sym3, Sym6
 from .mujoco_law import MIN_FRICTION, MujocoLaw, impedance, stiffness_damping
 from .rows import Impulses, Rows, add_rows, take
 
@@ -53,7 +56,9 @@ class MujocoNewton(Solver):
 
     name = "mujoco"
     contact = "mujoco"
+    models = ("mujoco",)
     level = "force"
+    spins = True
 
     def __post_init__(self):
         if self.iterations < 2 or self.search < 1:
@@ -108,13 +113,18 @@ class MujocoNewton(Solver):
 
 @struct
 class _Law:
-    """Normal and friction stiffness dn, dt = 1/R (zero where no contact acts), mu, mu', reference x = h a_ref."""
+    """Normal and friction stiffness dn, dt = 1/R (zero where no contact acts), mu, mu', reference x = h a_ref;
+    stiffness and coefficients of the rows of torsion (ds, mu_spin) and rolling (dr, mu_roll)."""
 
     dn: jax.Array
     reference: Impulses
     dt: jax.Array | None = None
     mu: jax.Array | None = None
     mu_reg: jax.Array | None = None
+    ds: jax.Array | None = None
+    mu_spin: jax.Array | None = None
+    dr: jax.Array | None = None
+    mu_roll: jax.Array | None = None
 
 
 def _law(c: Contacts, rows: Rows, problem: Problem) -> _Law:
@@ -129,22 +139,27 @@ def _law(c: Contacts, rows: Rows, problem: Problem) -> _Law:
     acts = c.live & (rows.phi < law.margin)
     stiffness = jnp.where(acts, 1.0, 0.0) / jnp.maximum((1.0 - d) / d * weight, 1e-15)
     k, b = stiffness_damping(law, h, law.timeconst, law.dampratio)
-    u = dense.at_points(c, problem.v0, problem.w0)
-    if rows.surface is not None:
-        s = c.turn(rows.surface)
-        u = _minus(u, Impulses(s.z, s.x, s.y) if c.friction else Impulses(s.z))
+    u = dense.relative(c, rows, problem.v0, problem.w0)
     normal = -h * (b * u.n + k * d * (rows.phi - law.margin))
     if not c.friction:
         return materialise(_Law(stiffness, Impulses(normal)), problem.one)
     if law.timeconst_friction is not None:
         _, b = stiffness_damping(law, h, law.timeconst_friction, law.dampratio_friction)
     mu = jnp.maximum(rows.mu, MIN_FRICTION)
-    reference = Impulses(normal, -h * b * u.t1, -h * b * u.t2)
+    slowing = lambda x: None if x is None else -h * b * x
+    reference = Impulses(normal, *(slowing(x) for x in (u.t1, u.t2, u.s, u.r1, u.r2)))
     tangential = stiffness * law.impratio
-    if law.frictional is not None:
-        tangential = jnp.where(law.frictional, tangential, 0.0)
-        mu = jnp.where(law.frictional, mu, 0.0)
-    return materialise(_Law(stiffness, reference, tangential, mu, mu / jnp.sqrt(law.impratio)), problem.one)
+    angular = {}
+    for name, d, coefficient, least in (("mu_spin", "ds", rows.mu_spin, 4), ("mu_roll", "dr", rows.mu_roll, 6)):
+        if coefficient is not None:
+            nu = jnp.maximum(coefficient, MIN_FRICTION)
+            if law.condim is not None:
+                nu = jnp.where(law.condim >= least, nu, 0.0)
+            angular |= {name: nu, d: tangential * (nu / mu) ** 2}
+    if law.condim is not None:
+        tangential = jnp.where(law.condim >= 3, tangential, 0.0)
+        mu = jnp.where(law.condim >= 3, mu, 0.0)
+    return materialise(_Law(stiffness, reference, tangential, mu, mu / jnp.sqrt(law.impratio), **angular), problem.one)
 
 
 def _free(c: Contacts, law: _Law, problem: Problem) -> Impulses:
@@ -172,11 +187,13 @@ def _newton(cs, laws, p, x, problem: Problem):
     return p, jax.tree.map(jnp.add, x, dx)
 
 
-def _cone(law: _Law, x: Impulses) -> tuple[Impulses, Sym3]:
+def _cone(law: _Law, x: Impulses) -> tuple[Impulses, Sym3 | Sym6]:
     """Impulse of every point and G = -d impulse / dx."""
     if law.dt is None:
         g = jnp.where(x.n < 0, law.dn, 0.0)
         return Impulses(-g * x.n), Sym3(g)
+    if law.ds is not None:
+        return _full_cone(law, x)
     mu, reg = law.mu, law.mu_reg
     s = x.t1 * x.t1 + x.t2 * x.t2
     moves = (s > 0) & (mu > 0)
@@ -204,6 +221,51 @@ def _cone(law: _Law, x: Impulses) -> tuple[Impulses, Sym3]:
         yz=-c * mu * e2,
     )
     return force, g
+
+
+def _full_cone(law: _Law, x: Impulses) -> tuple[Impulses, Sym6]:
+    """``_cone`` with the rows of torsion and, where there are any, of rolling."""
+    reg = law.mu_reg
+    # axes of the friction rows: velocity, coefficient, stiffness; sliding along x and y, then turning about them
+    rows = {"x": (x.t1, law.mu, law.dt), "y": (x.t2, law.mu, law.dt), "s": (x.s, law.mu_spin, law.ds)}
+    if law.dr is not None:
+        rows |= {"p": (x.r1, law.mu_roll, law.dr), "q": (x.r2, law.mu_roll, law.dr)}
+    scaled = {k: mu * u for k, (u, mu, _) in rows.items()}
+    s = sum(u * u for u in scaled.values())
+    moves = s > 0
+    t = jnp.sqrt(jnp.where(moves, s, 1.0))
+    e = {k: jnp.where(moves, u / t, 0.0) for k, u in scaled.items()}
+    slip = jnp.where(moves, t, 0.0)
+    normal = reg * x.n
+    separates = jnp.where(law.mu > 0, normal >= reg * slip, x.n >= 0)
+    sticks = ~separates & (reg * normal + slip <= 0)
+    slides = ~separates & ~sticks
+    c = jnp.where(slides, law.dn, 0.0) / (jnp.where(law.mu > 0, reg, 1.0) * (1.0 + reg * reg))
+    fn = c * (reg * slip - normal)
+    kn = jnp.where(sticks, law.dn, 0.0)
+    k = {i: jnp.where(sticks, d, 0.0) for i, (_, _, d) in rows.items()}
+    f = {i: -mu * fn * e[i] - k[i] * u for i, (u, mu, _) in rows.items()}
+    c = c * reg
+    around = jnp.where(moves, fn / t, 0.0)
+
+    def own(i):
+        mu = rows[i][1]
+        return k[i] + mu * mu * (c * e[i] * e[i] + around * (1.0 - e[i] * e[i]))
+
+    def between(i, j):
+        return rows[i][1] * rows[j][1] * (c - around) * e[i] * e[j]
+
+    with_normal = {i: -c * mu * e[i] for i, (_, mu, _) in rows.items()}
+    linear = Sym3(kn + c, xx=own("x"), yy=own("y"), xy=between("x", "y"), xz=with_normal["x"], yz=with_normal["y"])
+    if law.dr is None:
+        cross = tuple((None, None, z) for z in (between("x", "s"), between("y", "s"), with_normal["s"]))
+        return Impulses(fn - kn * x.n, f["x"], f["y"], f["s"]), Sym6(linear, cross, Sym3(own("s")))
+    cross = (
+        *(tuple(between(i, j) for j in "pqs") for i in "xy"),
+        tuple(with_normal[j] for j in "pqs"),
+    )
+    angular = Sym3(own("s"), xx=own("p"), yy=own("q"), xy=between("p", "q"), xz=between("p", "s"), yz=between("q", "s"))
+    return Impulses(fn - kn * x.n, *(f[i] for i in "xyspq")), Sym6(linear, cross, angular)
 
 
 class _Lines:

@@ -5,7 +5,8 @@ A row with impedance d(r), regularisation R and reference acceleration
     a_ref = -b u_n - k d r  (normal),  -b u_t  (friction),     r = phi - margin,  R = (1 - d) / d * A
 
 stands for a constraint whose force is f = (a_ref - a) / R, limited to the friction cone. A is the sum of the
-translational inverse masses; friction rows have R / impratio.
+translational inverse masses; friction rows have R / impratio, those of torsion and rolling, with the coefficient
+nu [m], R / impratio (mu / nu)^2.
 
 Source: MuJoCo documentation, "Computation: constraint model", and the numbers of ``MjData`` (efc_KBIP, efc_R,
 efc_aref) of version 4.0.1, in which a contact acts where phi < margin and margins of two geoms add.
@@ -33,7 +34,7 @@ class MujocoLaw:
     dmin, dmax, width, midpoint, power: solimp.
     margin: a contact acts where phi < margin [m]. impratio: ratio of friction to normal impedance.
     timeconst_friction, dampratio_friction: solreffriction, None = solref.
-    frictional: bool, pairs of contact dimension 3; None = all of them (where ``Rows.mu`` is given).
+    condim: contact dimension of each pair; None = all that the group has rows for.
     refsafe: the time constant is at least two steps.
     """
 
@@ -48,7 +49,7 @@ class MujocoLaw:
     impratio: jax.Array
     timeconst_friction: jax.Array | None = None
     dampratio_friction: jax.Array | None = None
-    frictional: jax.Array | None = None
+    condim: jax.Array | None = None
     refsafe: bool = static(default=True)
 
 

@@ -2,12 +2,12 @@
 
 The end-of-step velocities minimise (v - v*)' M (v - v*) / 2 + sum_c l_c(J_c v), whose contact impulses are
 
-    normal    p_n = max((vhat - u_n) / R, 0)                R = beta^2 / (4 pi^2) w N
+    normal    p_n = max((vhat - u_n) / R, 0)                R, vhat of the contact model
     friction  p_t = -mu g0 u_t / D,  D = sqrt(|u_t|^2 + eps^2),  eps = max(v_s, mu sigma w g0)
 
 Symbols: u relative velocity of a point; w inverse mass seen by its normal row; N number of live points of
-the pair, so that the stiffness of a pair does not depend on how many points share the load; vhat = -phi/h,
-at most ``push_speed``; g0 the normal impulse that bounds friction, frozen while the problem is solved.
+the pair; g0 the normal impulse that bounds friction, frozen while the problem is solved. R is at least
+event_beta^2 / (4 pi^2) w N, which is what an impact with restitution has, to hit its target velocity.
 
 Sources: Castro et al. 2022 (SAP, near-rigid regularisation); Castro, Han, Masterjohn 2024 (irrotational
 contact fields, "Lagged"). Differs:
@@ -28,18 +28,19 @@ Gradients: exact, of the iteration as it runs, forward and reverse.
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..spatial import Vec3
 from ..struct import struct
 from ..xla import materialise
 from . import dense
 from .base import Problem, Solution, Solver
 from .dense import Contacts, Sym3
+from .laws import contact_model
+from .laws.base import points
+from .laws.near_rigid import near_rigid
 from .restitution import targets
 from .rows import Impulses, Index, Rows, take
 
@@ -50,22 +51,17 @@ class NewtonLagged(Solver):
 
     Attributes:
       iterations: Newton steps, at least 2 (one is unsafe).
-      beta: near-rigid parameter [-]; the overlap at rest is beta^2/(4 pi^2) w N p h for a point that
-        carries the impulse p a step.
-      event_beta: the same for an impact with restitution, which is to hit its target velocity.
+      event_beta: near-rigid parameter (see ``laws.near_rigid``) of impacts and of rows that are rigid in the model [-].
       slip_speed: friction is regularised below this speed v_s [m/s]; a held body creeps at a fraction of it.
       slip_compliance: sigma [-], bounds the stiffness of friction to 1/(sigma w).
-      push_speed: bound of the speed at which overlap is resolved [m/s].
       tolerance: a world is ``unconverged`` where the residual of a row, as a velocity, exceeds this
         fraction of the fastest relative velocity (before or wanted) plus slip_speed.
     """
 
     iterations: int = 3
-    beta: float = 0.1
     event_beta: float = 0.02
     slip_speed: float = 1e-4
     slip_compliance: float = 1e-3
-    push_speed: float = 3.0
     tolerance: float = 5e-2
 
     name = "newton_lagged"
@@ -80,8 +76,8 @@ class NewtonLagged(Solver):
             return self._closed_form(problem)
         one = problem.one
         cs = tuple(dense.contacts(rows, problem) for rows in problem.rows)
-        free = tuple(_relative(c, rows, problem.v, problem.w) for c, rows in zip(cs, problem.rows))
-        laws = tuple(self._law(c, rows, problem) for c, rows in zip(cs, problem.rows))
+        free = tuple(dense.relative(c, rows, problem.v, problem.w) for c, rows in zip(cs, problem.rows))
+        laws = tuple(self._law(c, rows, problem, self.event_beta) for c, rows in zip(cs, problem.rows))
         p = tuple(_start(c, g) for c, g in zip(cs, problem.warm))
         start = dense.response(problem, *dense.on_bodies(cs, p, problem))
         u = tuple(_plus(x, dense.at_points(c, *start)) for c, x in zip(cs, free))
@@ -109,16 +105,17 @@ class NewtonLagged(Solver):
             unconverged=self._unconverged(cs, laws, bound, p, u, free),
         )
 
-    def _law(self, c: Contacts, rows: Rows, problem: Problem) -> _Law:
+    def _law(self, c: Contacts, rows: Rows, problem: Problem, event_beta: float) -> _Law:
         w = dense.inverse_mass(c, problem)
-        points = jnp.maximum(c.live.sum(0), 1).astype(w.dtype)
-        stiff = _near_rigid(self.beta) * points
-        vhat = jnp.minimum(-rows.phi / problem.h, self.push_speed)
+        count = points(rows, w.dtype)
+        model = contact_model(self, problem).law(rows, w, problem)
+        least = near_rigid(event_beta) * count * w
+        vhat, r = model.vhat, least if model.r is None else jnp.maximum(model.r, least)
         if rows.e is not None:
             events = targets(rows, problem)
-            vhat = jnp.where(events.active, events.vhat, vhat)
-            stiff = jnp.where(events.active, _near_rigid(self.event_beta) * points, stiff)
-        law = _Law(w=w, r=stiff * w, vhat=vhat, points=points, mu=rows.mu)
+            vhat = events.target(vhat)
+            r = jnp.where(events.active, least, r)
+        law = _Law(w=w, r=r, vhat=vhat, points=count, mu=rows.mu)
         return materialise(law, problem.one)
 
     def _linearise(self, c: Contacts, law: _Law, bound, p: Impulses, u: Impulses) -> tuple[Impulses, Sym3]:
@@ -170,8 +167,8 @@ class NewtonLagged(Solver):
         (rows,) = problem.rows
         one = problem.one
         c = dense.contacts(rows, problem)
-        u = _relative(c, rows, problem.v, problem.w)
-        law = self._law(c, rows, problem)
+        u = dense.relative(c, rows, problem.v, problem.w)
+        law = self._law(c, rows, problem, 0.0)
         pn = jnp.where(c.live, jnp.maximum((law.vhat - u.n) / (law.r + law.w), 0.0), 0.0)
         p = Impulses(pn)
         if c.friction:
@@ -199,10 +196,6 @@ class _Law:
     mu: jax.Array | None
 
 
-def _near_rigid(beta: float) -> float:
-    return beta * beta / (4.0 * math.pi**2)
-
-
 def _single_sphere(problem: Problem) -> bool:
     """One central contact a body with fixed geometry only: the rows do not see each other."""
     if len(problem.rows) != 1:
@@ -212,15 +205,6 @@ def _single_sphere(problem: Problem) -> bool:
     if not alone or not isinstance(rows.b, Index) or len(np.unique(rows.b.rows)) != len(rows.b):
         return False
     return rows.mu is None or problem.w is None or problem.inertia.isotropic
-
-
-def _relative(c: Contacts, rows: Rows, v: Vec3, w: Vec3 | None) -> Impulses:
-    """Velocity of the points relative to the partner, which may move as prescribed."""
-    u = dense.at_points(c, v, w)
-    if rows.surface is None:
-        return u
-    s = c.turn(rows.surface)
-    return _minus(u, Impulses(s.z, s.x, s.y) if c.friction else Impulses(s.z))
 
 
 def _start(c: Contacts, warm: Impulses) -> Impulses:

@@ -32,12 +32,19 @@ class Events:
     vhat: normal velocity it must have at the end of the step [m/s].
     left: time from the impact to the end of the step [s].
     accel: normal acceleration a [m/s^2].
+    bound: a slot whose ballistic path does not close its gap within the step must not be stopped at its end
+      because u h would: its target velocity is at most this, infinite elsewhere [m/s].
     """
 
     active: jax.Array
     vhat: jax.Array
     left: jax.Array
     accel: jax.Array
+    bound: jax.Array
+
+    def target(self, vhat: jax.Array) -> jax.Array:
+        """Target velocities of the rows, ``vhat`` where there is no impact [m/s]."""
+        return jnp.where(self.active, self.vhat, jnp.minimum(vhat, self.bound))
 
 
 def normal_velocity(rows: Rows, v: Vec3, w: Vec3 | None) -> jax.Array:
@@ -78,4 +85,6 @@ def targets(rows: Rows, problem: Problem) -> Events:
         & (s > THRESHOLD * jnp.abs(a) * h)
         & (e * s + 0.5 * a * left >= 0)  # leaves for the rest of the step, not back through the surface
     )
-    return Events(active, vhat, jnp.where(active, left, 0.0), a)
+    end = u0 + a * h
+    misses = phi + 0.5 * h * (u0 + end) > 0
+    return Events(active, vhat, jnp.where(active, left, 0.0), a, jnp.where(misses, end, jnp.inf))

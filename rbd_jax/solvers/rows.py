@@ -8,6 +8,10 @@ from the centres of mass, the relative velocity at the point is
 with normal part n . u (n points from A to B) and tangential parts t1 . u, t2 . u. An impulse
 p = n pn + t1 p1 + t2 p2 acts on B at rB and -p on A at rA.
 
+Torsional and rolling friction add rows of the relative angular velocity wB - wA: its part n . w about the
+normal, and t1 . w, t2 . w about the tangents. Their angular impulse n s + t1 r1 + t2 r2 acts on B and its
+opposite on A, whatever the arms.
+
 When the partner is not a body (static or kinematic), the moving body is always B: the normal
 points from the partner to the body.
 """
@@ -18,7 +22,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..spatial import Vec3, tangent_basis
+from ..bodies import Inertia
+from ..spatial import Quat, Vec3, components, tangent_basis
 from ..struct import static, struct
 
 
@@ -51,8 +56,11 @@ class Rows:
       phi: signed gap [m], negative = overlap, (S, P, B).
       live: slots that hold a point, bool (S, P, B).
       mu: friction coefficient (P, 1) or (P, B), None = frictionless (no tangential rows at all).
+      mu_spin: coefficient of torsional friction [m], like mu; None = no row about the normal.
+      mu_roll: coefficient of rolling friction [m], None = no rows about the tangents; needs mu_spin, which needs mu.
       e: restitution coefficient, None = absent.
       surface: velocity of a kinematic partner at the points [m/s], (S, P, B), None = at rest.
+      surface_spin: its angular velocity [rad/s], (P, B); None = at rest, or no row that needs it.
       feature: manifold code for warm starting, int32 (P, B) or (1, 1).
       law: per-pair numbers of a contact law that a solver asks for (solref, solimp, ...), or None.
       central_a, central_b: the normal passes through that body's centre of mass (a sphere whose
@@ -70,6 +78,9 @@ class Rows:
     mu: jax.Array | None = None
     e: jax.Array | None = None
     surface: Vec3 | None = None
+    mu_spin: jax.Array | None = None
+    mu_roll: jax.Array | None = None
+    surface_spin: Vec3 | None = None
     feature: jax.Array | None = None
     law: object = None
     central_a: bool = static(default=False)
@@ -90,11 +101,18 @@ jax.tree_util.register_static(Index)
 
 @struct
 class Impulses:
-    """Contact impulses of one group [N s], (S, P, B); t1 and t2 are None without friction."""
+    """Contact impulses of one group [N s], (S, P, B), and the angular impulses of its angular rows [N m s].
+
+    t1 and t2 are None without friction, s (about the normal) without torsional friction, r1 and r2 (about t1
+    and t2) without rolling friction.
+    """
 
     n: jax.Array
     t1: jax.Array | None = None
     t2: jax.Array | None = None
+    s: jax.Array | None = None
+    r1: jax.Array | None = None
+    r2: jax.Array | None = None
 
 
 @struct
@@ -150,3 +168,23 @@ def add_rows(x: jax.Array, index, values: jax.Array, unique: bool = False) -> ja
             return x + values
         return x.at[rows].add(values, unique_indices=unique)
     return x.at[index, jnp.arange(x.shape[1])[None, :]].add(values)
+
+
+def inverse_inertia(inertia: Inertia, q: Quat) -> InverseInertia:
+    """R I^-1 R^T of every body."""
+    if inertia.isotropic:
+        return InverseInertia(1.0 / inertia.moments)
+    r = q.mat()
+    d = Vec3(*(1.0 / c for c in (inertia.moments.x, inertia.moments.y, inertia.moments.z)))
+    ax, bx, cx = r.a * d, r.b * d, r.c * d
+    return InverseInertia(ax.dot(r.a), bx.dot(r.b), cx.dot(r.c), ax.dot(r.b), ax.dot(r.c), bx.dot(r.c))
+
+
+def spread(total: Vec3, rows: Rows, values: Vec3) -> Vec3:
+    """``total`` (n, B) with pair values (P, B) added to body B and subtracted from body A."""
+
+    def side(total, index, sign):
+        return Vec3(*(add_rows(t, index, sign * v) for t, v in zip(components(total), components(values))))
+
+    total = side(total, rows.b, 1.0)
+    return total if rows.a is None else side(total, rows.a, -1.0)

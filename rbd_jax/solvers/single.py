@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from ..spatial import Vec3, components, zeros_like
 from ..xla import materialise
 from .base import Problem, Solution
+from .laws import ContactModel
 from .restitution import targets
 from .rows import Impulses, Index, add_rows, take, take_tree
 
@@ -35,9 +36,9 @@ def applies(problem: Problem) -> bool:
     )
 
 
-def solve(problem: Problem, recovery) -> Solution:
-    """The solution; ``recovery(phi, h)`` gives the velocity bias that moves the pose."""
-    rows, h, one = problem.rows[0], problem.h, problem.one
+def solve(problem: Problem, model: ContactModel) -> Solution:
+    """The solution. The compliance of a model counts only where it is the material's."""
+    rows, one = problem.rows[0], problem.one
     n, phi, live = rows.n, rows.phi[0], rows.live[0]
     inv_mass = take(problem.inv_mass, rows.b)
     u = take_tree(problem.v, rows.b)
@@ -48,12 +49,19 @@ def solve(problem: Problem, recovery) -> Solution:
         u = u - rows.surface.map(lambda c: c[0])
     un = n.dot(u)
     mass = jnp.where(live, 1.0, 0.0).astype(un.dtype) / inv_mass
-    bias = recovery(phi, h)
-    moving = jnp.maximum(-(un + bias) * mass, 0.0)
-    # at the end of the step no bias: what closed its gap or overlaps has stopped
-    end = jnp.where(phi > 0, jnp.where(moving > 0, jnp.maximum(-un * mass, 0.0), 0.0), jnp.maximum(-un * mass, 0.0))
+    law = model.law(rows, inv_mass[None], problem)
+    soft = mass / (1.0 + law.r[0] * mass) if model.physical and law.r is not None else mass
+    vhat, events = law.vhat, None
     if rows.e is not None:
         events = targets(rows, problem)
+        vhat = jnp.minimum(vhat, events.bound)
+    moving = jnp.maximum((vhat[0] - un) * soft, 0.0)
+    if model.physical:
+        end = moving
+    else:  # at the end of the step no bias: what closed its gap or overlaps has stopped
+        end = jnp.maximum(-un * mass, 0.0)
+        end = jnp.where(phi > 0, jnp.where(moving > 0, end, 0.0), end)
+    if events is not None:
         bounce = jnp.maximum((events.vhat[0] - un) * mass, 0.0)
         hit = events.active[0]
         moving, end = jnp.where(hit, bounce, moving), jnp.where(hit, bounce, end)

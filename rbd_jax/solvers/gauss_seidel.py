@@ -1,0 +1,440 @@
+"""Layer 5: coloured Gauss-Seidel sweeps over contact rows, the inner loop of TGS and PGS.
+
+The rows of a colour share no body and are solved at once; colours, and the slots of a pair, in order. The three
+rows of a point are one block: the normal impulse, then the friction disc |p_t| <= mu p_n around it.
+Pairs that differ from world to world are coloured in the step and put into chunks (``colouring``).
+
+Symbols: n, t1, t2 contact frame; r arm; k inverse mass seen by a row; l accumulated impulse.
+Cost: about 100 flops a point and sweep.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..spatial import Vec3
+from ..struct import struct
+from ..xla import materialise
+from .base import Problem, Solution
+from .colouring import Plan, plan
+from .laws import Law
+from .restitution import Events, normal_velocity, targets
+from .rows import Impulses, Index, Rows, add_rows, take, take_tree
+
+#: Groups with more rows than this (slots x colours) loop over their slots instead of unrolling them.
+UNROLL = 4
+
+
+@struct
+class Group:
+    """A group of rows with what every sweep needs: effective masses and, with restitution, events.
+
+    plan: for pairs that differ from world to world: where they went; the rows are in the order of its places.
+    """
+
+    rows: Rows
+    t1: Vec3 | None
+    t2: Vec3 | None
+    inv_mass_b: jax.Array
+    inv_mass_a: jax.Array | None
+    inertia_b: object
+    inertia_a: object
+    k_n: jax.Array
+    mass_n: jax.Array  # 1/k, zero where the slot is not live
+    mass_1: jax.Array | None
+    mass_2: jax.Array | None
+    events: Events | None
+    plan: Plan | None = None
+
+
+@struct
+class Sweep:
+    """l_n' = max(l_n - inv (u + bias) - soft l_n, 0); leaves (S, P, B) or scalars.
+
+    bias: minus the target velocity. inv: 1 / (k + r), zero for a row that is left alone. soft: r / (k + r).
+    """
+
+    bias: jax.Array
+    inv: jax.Array
+    soft: jax.Array | float
+
+
+def biased(g: Group, law: Law) -> Sweep:
+    """The sweep of a contact law; an impact hits its target velocity rigidly."""
+    bias, r = -law.vhat, law.r
+    if g.events is not None:
+        hit = g.events.active
+        bias = -g.events.target(law.vhat)
+        r = None if r is None else jnp.where(hit, 0.0, r)
+    if r is None:
+        return Sweep(bias, g.mass_n, 0.0)
+    share = 1.0 / (1.0 + r * g.mass_n)
+    return Sweep(bias, g.mass_n * share, 1.0 - share)
+
+
+def relaxing(g: Group, lam: Impulses, body, h) -> Sweep:
+    """No bias on overlap; gaps as they are after the move.
+
+    A gap that did not close in this step is left alone: its impact belongs to the next step.
+    """
+    phi = g.rows.phi + h * normal_velocity(g.rows, *body)
+    bias = jnp.where(g.rows.phi <= 0, 0.0, jnp.maximum(phi, 0.0) / h)
+    idle = (g.rows.phi > 0) & (lam.n <= 0)
+    if g.events is not None:
+        bias = jnp.where(g.events.active, -g.events.vhat, bias)
+        idle = idle & ~g.events.active
+    return Sweep(bias, jnp.where(idle, 0.0, g.mass_n), 0.0)
+
+
+def arranged(tree, plan: Plan | None):
+    """Arrays over pairs, (C, B) or (S, C, B), in the order of the plan's places; arrays of one pair stay."""
+    if plan is None:
+        return tree
+    pairs = plan.place.shape[0]
+    source = jnp.minimum(plan.source, pairs - 1)
+    return jax.tree.map(lambda c: _places(c, source) if jnp.ndim(c) and c.shape[-2] == pairs else c, tree)
+
+
+def _places(c: jax.Array, index: jax.Array) -> jax.Array:
+    """c (..., P, B or 1) at ``index`` (Q, B) of its pair axis."""
+    if c.shape[-1] == 1:
+        c = jnp.take(c[..., 0], index, axis=-1, mode="clip")
+        return c
+    return jnp.take_along_axis(c, index.reshape((1,) * (c.ndim - 2) + index.shape), axis=-2, mode="clip")
+
+
+def _restored(lam: Impulses, g: Group) -> Impulses:
+    """Impulses in the order of the pairs again; zero for a pair that has no place."""
+    if g.plan is None:
+        return lam
+    place = g.plan.place
+    back = lambda c: jnp.where(place < c.shape[-2], _places(c, jnp.minimum(place, c.shape[-2] - 1)), 0.0)
+    return jax.tree.map(back, lam)
+
+
+def _planned(rows: Rows, problem: Problem) -> tuple[Rows, Plan]:
+    """The rows of a group whose pairs differ from world to world, in chunks."""
+    p = plan(rows.b, rows.a, rows.live.any(axis=0), problem.v.x.shape[0])
+    rows = arranged(rows, p)
+    return rows._with(live=rows.live & (p.source < p.place.shape[0])), p
+
+
+def prepare(rows: Rows, problem: Problem) -> Group:
+    one = problem.one
+    chunks = None
+    if not isinstance(rows.b, Index):
+        rows, chunks = _planned(rows, problem)
+    rows = rows._with(
+        rb=materialise(rows.rb, one),
+        ra=materialise(rows.ra, one),
+        phi=materialise(rows.phi, one),
+        n=materialise(rows.n, one),
+    )
+    t1, t2 = rows.tangents if rows.mu is not None else (None, None)
+    spin = problem.w is not None
+    sides = []
+    for index in (rows.b, rows.a):
+        if index is None:
+            sides.append((None, None))
+        else:
+            sides.append((take(problem.inv_mass, index), problem.inv_inertia.take(index) if spin else None))
+    if chunks is not None:  # gathers are cheap, but not in every kernel that uses them
+        sides, t1, t2 = materialise((sides, t1, t2), one)
+    (mb, ib), (ma, ia) = sides
+
+    def k(d: Vec3, central_b: bool, central_a: bool):
+        total = mb
+        if ib is not None and not central_b:
+            j = rows.rb.cross(d)
+            total = total + j.dot(ib @ j)
+        if ma is not None:
+            total = total + ma
+            if ia is not None and not central_a:
+                j = rows.ra.cross(d)
+                total = total + j.dot(ia @ j)
+        return total
+
+    def mass(k):
+        return jnp.where(rows.live, 1.0, 0.0).astype(rows.phi.dtype) / k
+
+    k_n = k(rows.n, rows.central_b, rows.central_a)
+
+    return Group(
+        rows,
+        t1,
+        t2,
+        mb,
+        ma,
+        ib,
+        ia,
+        k_n=k_n,
+        mass_n=mass(k_n),
+        mass_1=mass(k(t1, False, False)) if t1 is not None else None,
+        mass_2=mass(k(t2, False, False)) if t2 is not None else None,
+        events=materialise_events(targets(rows, problem), one) if rows.e is not None else None,
+        plan=chunks,
+    )
+
+
+def materialise_events(events: Events, one) -> Events:
+    return events._with(vhat=materialise(events.vhat, one), left=materialise(events.left, one))
+
+
+def apply(g: Group, lam: Impulses, body):
+    """Velocities after the impulses ``lam`` of one group (warm start)."""
+    v, w = body
+    rows = g.rows
+    p = rows.n * lam.n
+    if lam.t1 is not None:
+        p = p + g.t1 * lam.t1 + g.t2 * lam.t2
+    total = p.map(lambda c: c.sum(0))
+
+    def side(v, w, index, inv_mass, inertia, arm, sign):
+        v = Vec3(
+            *(add_rows(c, index, sign * inv_mass * d) for c, d in zip((v.x, v.y, v.z), (total.x, total.y, total.z)))
+        )
+        if w is not None and not (rows.mu is None and (rows.central_b if sign > 0 else rows.central_a)):
+            turn = inertia @ arm.cross(p).map(lambda c: c.sum(0))
+            w = Vec3(*(add_rows(c, index, sign * d) for c, d in zip((w.x, w.y, w.z), (turn.x, turn.y, turn.z))))
+        return v, w
+
+    v, w = side(v, w, rows.b, g.inv_mass_b, g.inertia_b, rows.rb, 1.0)
+    if rows.a is not None:
+        v, w = side(v, w, rows.a, g.inv_mass_a, g.inertia_a, rows.ra, -1.0)
+    return v, w
+
+
+def sweep(g: Group, law: Sweep, lam: Impulses, body, one):
+    """One Gauss-Seidel sweep over a group: colours one after the other, slots one after the other."""
+    rows = g.rows
+    pairs = rows.phi.shape[1]
+    if not isinstance(rows.b, Index):
+        return _sweep_chunks(g, law, lam, body, one)
+    colours = rows.colours or ((0, pairs),)
+    whole = len(colours) == 1
+    if not whole and rows.slots > UNROLL:
+        return _sweep_colours(g, law, lam, body, one)
+    pieces = []
+    for start, stop in colours:
+
+        def cut(x, axis):
+            """This colour's pairs; arrays that are the same for all pairs stay as they are."""
+            same = lambda c: whole or jnp.ndim(c) <= axis or c.shape[axis] == 1
+            return jax.tree.map(lambda c: c if same(c) else jax.lax.slice_in_dim(c, start, stop, axis=axis), x)
+
+        b = Index(rows.b.rows[start:stop])
+        a = Index(rows.a.rows[start:stop]) if rows.a is not None else None
+        local = (take_tree(body, b), take_tree(body, a) if a is not None else None)
+        flat = (rows.n, rows.mu, g.t1, g.t2, g.inv_mass_b, g.inv_mass_a, g.inertia_b, g.inertia_a)
+        pair = _pair(rows, *cut(flat, 0), a, b)
+        slots = cut((rows.rb, rows.ra, rows.surface, g.mass_1, g.mass_2, law, lam), 1)
+        local, new = _slots(pair, slots, local, one, unroll=rows.slots * len(colours) <= UNROLL)
+        body = _write(body, b, local[0])
+        if a is not None:
+            body = _write(body, a, local[1])
+        pieces.append(new)
+    if whole:
+        return body, pieces[0]
+    return body, jax.tree.map(lambda *c: jnp.concatenate(c, axis=1), *pieces)
+
+
+def _sweep_colours(g: Group, law: Sweep, lam: Impulses, body, one):
+    """As ``_sweep``, the colours (all of one width) in a compiled loop: the program does not grow with them.
+
+    A colour may hold dead copies of a pair as padding; their change is exactly zero, so changes are added.
+    """
+    rows = g.rows
+    width = rows.colours[0][1] - rows.colours[0][0]
+    count = len(rows.colours)
+    table = lambda index: None if index is None else jnp.asarray(index.rows.reshape(count, width))
+    table_b, table_a = table(rows.b), table(rows.a)
+
+    def cut(x, axis, k):
+        same = lambda c: jnp.ndim(c) <= axis or c.shape[axis] == 1
+        part = lambda c: jax.lax.dynamic_slice_in_dim(c, k * width, width, axis=axis)
+        return jax.tree.map(lambda c: c if same(c) else part(c), x)
+
+    def colour(carry, k):
+        body, lam = carry
+        b = table_b[k]
+        a = None if table_a is None else table_a[k]
+        get = lambda i: jax.tree.map(lambda c: c[i], body)
+        old = (get(b), None if a is None else get(a))
+        flat = (rows.n, rows.mu, g.t1, g.t2, g.inv_mass_b, g.inv_mass_a, g.inertia_b, g.inertia_a)
+        n, mu, t1, t2, mb, ma, ib, ia = cut(flat, 0, k)
+        pair = _pair(rows, n, mu, t1, t2, mb, ma, ib, ia)
+        slots = cut((rows.rb, rows.ra, rows.surface, g.mass_1, g.mass_2, law, lam), 1, k)
+        new, part = _slots(pair, slots, old, one, unroll=False)
+        add = lambda body, i, new, old: jax.tree.map(lambda c, p, q: c.at[i].add(p - q), body, new, old)
+        body = add(body, b, new[0], old[0])
+        if a is not None:
+            body = add(body, a, new[1], old[1])
+        put = lambda whole, part: jax.lax.dynamic_update_slice_in_dim(whole, part, k * width, axis=1)
+        return (body, jax.tree.map(put, lam, part)), None
+
+    lam = jax.tree.map(lambda c: jnp.broadcast_to(c, rows.phi.shape), lam)
+    (body, lam), _ = jax.lax.scan(colour, (body, lam), jnp.arange(count))
+    return body, lam
+
+
+def _pair(rows: Rows, n, mu, t1, t2, inv_mass_b, inv_mass_a, inertia_b, inertia_a, a=None, b=None) -> Group:
+    """What ``_point`` needs of the pairs of one colour."""
+    bare = rows._with(
+        n=n, mu=mu, rb=None, ra=None, phi=None, live=None, e=None, surface=None, feature=None, law=None, a=a, b=b
+    )
+    return Group(bare, t1, t2, inv_mass_b, inv_mass_a, inertia_b, inertia_a, None, None, None, None, None)
+
+
+def _write(body, index: Index, values):
+    """Put the velocities of a colour back; no row appears twice."""
+    rows = index.rows
+
+    def put(x, new):
+        if len(rows) == x.shape[0] and np.array_equal(rows, np.arange(len(rows))):
+            return new
+        return x.at[rows].set(new, unique_indices=True)
+
+    return jax.tree.map(put, body, values)
+
+
+def _slots(pair: Group, slots, local, one, unroll: bool):
+    """All slots of one colour in order. slots: leaves (S, P, B) or without a slot axis."""
+    count = slots[-1].n.shape[0]
+    if unroll:
+        new = []
+        for s in range(count):
+            at = jax.tree.map(lambda c: c if jnp.ndim(c) < 3 else c[min(s, c.shape[0] - 1)], slots)
+            local, l = _point(pair, at, local, one)
+            new.append(l)
+        if count == 1:
+            return local, jax.tree.map(lambda c: c[None], new[0])
+        return local, jax.tree.map(lambda *c: jnp.stack(c), *new)
+    leaves, tree = jax.tree.flatten(slots)
+    rolled = [jnp.ndim(c) == 3 and c.shape[0] == count for c in leaves]
+
+    def body(local, xs):
+        xs = iter(xs)
+        at = [next(xs) if r else (c if jnp.ndim(c) < 3 else c[0]) for r, c in zip(rolled, leaves)]
+        return _point(pair, jax.tree.unflatten(tree, at), local, one)
+
+    return jax.lax.scan(body, local, [c for r, c in zip(rolled, leaves) if r])
+
+
+def _point(pair: Group, at, local, one):
+    """Update one slot of every pair of a colour: normal impulse, then the friction disc."""
+    rb, ra, surface, mass_1, mass_2, law, lam = at
+    rows = pair.rows
+    n, t1, t2 = rows.n, pair.t1, pair.t2
+    (vb, wb), other = local
+    va, wa = other if other is not None else (None, None)
+    spin = wb is not None
+
+    def velocity(d, central_b, central_a):
+        """d . u"""
+        u = d.dot(vb)
+        if spin and not central_b:
+            u = u + rb.cross(d).dot(wb)
+        if va is not None:
+            u = u - d.dot(va)
+            if spin and not central_a:
+                u = u - ra.cross(d).dot(wa)
+        if surface is not None:
+            u = u - d.dot(surface)
+        return u
+
+    u = velocity(n, rows.central_b, rows.central_a)
+    ln = jnp.maximum(lam.n - law.inv * (u + law.bias) - law.soft * lam.n, 0.0)
+    ln = materialise(ln, one)
+    dn = ln - lam.n
+    p = n * dn
+    l1 = l2 = None
+    if rows.mu is not None:
+        u1, u2 = velocity(t1, False, False), velocity(t2, False, False)
+        if spin and not rows.central_b:
+            j = pair.inertia_b @ rb.cross(n)
+            u1, u2 = u1 + rb.cross(t1).dot(j) * dn, u2 + rb.cross(t2).dot(j) * dn
+        if spin and va is not None and not rows.central_a:
+            j = pair.inertia_a @ ra.cross(n)
+            u1, u2 = u1 + ra.cross(t1).dot(j) * dn, u2 + ra.cross(t2).dot(j) * dn
+        c1, c2 = materialise((lam.t1 - mass_1 * u1, lam.t2 - mass_2 * u2), one)
+        limit, c = rows.mu * ln, c1 * c1 + c2 * c2
+        slips = c > limit * limit
+        shrink = jnp.where(slips, limit / jnp.sqrt(jnp.where(slips, c, 1.0)), 1.0)
+        l1, l2 = c1 * shrink, c2 * shrink
+        p = p + t1 * (l1 - lam.t1) + t2 * (l2 - lam.t2)
+    p = materialise(p, one)
+    vb = vb + p * pair.inv_mass_b
+    if spin and not (rows.mu is None and rows.central_b):
+        wb = wb + pair.inertia_b @ rb.cross(p)
+    new = (materialise((vb, wb), one), None)
+    if va is not None:
+        va = va - p * pair.inv_mass_a
+        if spin and not (rows.mu is None and rows.central_a):
+            wa = wa - pair.inertia_a @ ra.cross(p)
+        new = (new[0], materialise((va, wa), one))
+    return new, Impulses(ln, l1, l2)
+
+
+def _sweep_chunks(g: Group, law: Sweep, lam: Impulses, body, one):
+    """Pairs that differ from world to world: chunk after chunk, then the tail place after place.
+
+    Loops of fixed trip count; what is empty in every world is skipped.
+    """
+    rows, p = g.rows, g.plan
+    pairs, worlds, n = *p.source.shape, body[0].x.shape[0]
+    column = jnp.arange(worlds)[None, :]
+    filled = p.source < p.place.shape[0]
+    flat = (rows.n, rows.mu, g.t1, g.t2, g.inv_mass_b, g.inv_mass_a, g.inertia_b, g.inertia_a)
+    lam = jax.tree.map(lambda c: jnp.broadcast_to(c, rows.phi.shape), lam)
+    slots = (rows.rb, rows.ra, rows.surface, g.mass_1, g.mass_2, law, lam)
+
+    def run(body, start: int, width: int, active):
+        """``width`` places at a time from ``start`` on; the impulses (S, places, B)."""
+        idle = jax.tree.map(lambda c: jnp.zeros((c.shape[0], width, worlds), c.dtype), lam)
+
+        def work(body, first):
+            cut = lambda c: jax.lax.dynamic_slice_in_dim(c, first, width, axis=c.ndim - 2)
+            part = lambda tree: jax.tree.map(lambda c: cut(c) if jnp.ndim(c) and c.shape[-2] == pairs else c, tree)
+            index = [cut(i) for i in (rows.b, rows.a) if i is not None]
+            local = [take_tree(body, i) for i in index]
+            local, new = _slots(_pair(rows, *part(flat)), part(slots), (*local, None)[:2], one, rows.slots <= 2)
+            for i, values in zip(index, local):
+                target = jnp.where(cut(filled), i, n)
+                body = jax.tree.map(lambda c, v: c.at[target, column].set(v, mode="drop"), body, values)
+            return body, new
+
+        def entry(body, x):
+            first, active = x
+            return jax.lax.cond(active, work, lambda body, _: (body, idle), body, first)
+
+        first = jnp.arange(len(active), dtype=jnp.int32) * width + start
+        body, new = jax.lax.scan(entry, body, (first, active))
+        return body, jax.tree.map(lambda c: jnp.moveaxis(c, 0, 1).reshape(c.shape[1], -1, worlds), new)
+
+    body = jax.tree.map(lambda c: jnp.broadcast_to(c, (n, worlds)), body)
+    start = p.chunks * p.width
+    body, new = run(body, 0, p.width, p.active)
+    if not p.tail:
+        return body, new
+    rest = jax.tree.map(lambda c: c[:, start:], lam)
+    body, rest = jax.lax.cond(p.late.any(), lambda b: run(b, start, 1, p.late), lambda b: (b, rest), body)
+    return body, jax.tree.map(lambda *c: jnp.concatenate(c, axis=1), new, rest)
+
+
+def solution(problem: Problem, groups, body, lam, moving=(None, None)) -> Solution:
+    """What the bodies received: their end velocities against the predicted ones."""
+    v, w = body
+    overflow = None
+    for g in groups:
+        if g.plan is not None:
+            overflow = g.plan.overflow if overflow is None else overflow | g.plan.overflow
+    return Solution(
+        impulse=(v - problem.v) / problem.inv_mass,
+        angular_impulse=None if w is None else problem.inertia.momentum(problem.q, w - problem.w),
+        contacts=tuple(_restored(l, g) for l, g in zip(lam, groups)),
+        v_move=moving[0],
+        w_move=moving[1],
+        overflow=overflow,
+    )

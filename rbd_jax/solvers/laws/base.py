@@ -1,0 +1,65 @@
+"""Layer 5: what a contact model is.
+
+A model says how a contact yields, a solver finds the impulses. Both speak of one row:
+
+    p_n = max((vhat - u_n) / r, 0)          u_n normal velocity at the end of the step, p_n its impulse
+
+with the compliance r [1/kg] (0 = rigid) and the target velocity vhat [m/s]. A spring k with dashpot c
+stepped implicitly is r = 1 / (h (c + h k)), vhat = -phi h k / (c + h k) / h, so every linear law has this form.
+Friction is |p_t| <= mu p_n in every model; ``rt`` softens it for solvers with a true cone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from ...struct import struct
+from ..rows import Rows
+
+
+@struct
+class Law:
+    """The law of every row of a group, leaves (S, P, B) or what broadcasts to it.
+
+    vhat: target velocity [m/s]. r: compliance [1/kg], None = rigid everywhere.
+    rt: compliance of friction [1/kg], None: the solver's own. keep: part of its slip that friction
+    leaves a row by the end of the step [-], None = 0 (all of it is stopped, up to the cone).
+    """
+
+    vhat: jax.Array
+    r: jax.Array | None = None
+    rt: jax.Array | None = None
+    keep: jax.Array | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class ContactModel:
+    """A contact model: a frozen (hashable, static) dataclass of its constants."""
+
+    name: ClassVar[str]
+    #: which slots it wants: "all" however far, "step" those that may touch within the step,
+    #: "margin" those closer than their margin.
+    reach: ClassVar[str] = "step"
+    #: whether the compliance is the material's. If not, it is a means to be stable, and a solver may take out
+    #: of the velocities what it adds to recover from overlap.
+    physical: ClassVar[bool] = False
+
+    def law(self, rows: Rows, w: jax.Array, problem) -> Law:
+        """The law of one group; ``w`` [1/kg] (S, P, B) is the inverse mass seen by each normal row."""
+        raise NotImplementedError
+
+
+def points(rows: Rows, dtype) -> jax.Array:
+    """Number of live points of every pair, at least 1: they share its load. (P, B)."""
+    return jnp.maximum(rows.live.sum(0), 1).astype(dtype)
+
+
+def recovery(phi: jax.Array, problem, fraction, push_speed: float) -> jax.Array:
+    """Target velocity: a gap may close exactly; a ``fraction`` of an overlap is taken back a step [m/s]."""
+    gap = -phi / problem.h
+    back = gap if problem.nominal is None else -phi / problem.nominal
+    return jnp.where(phi <= 0, jnp.minimum(fraction * back, push_speed), gap)

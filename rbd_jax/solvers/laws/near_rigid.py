@@ -1,0 +1,55 @@
+"""Layer 5: near-rigid contact, r = beta^2 / (4 pi^2) w N, vhat = -phi / h.
+
+N is the number of live points of the pair: its stiffness does not depend on how many share the load.
+The overlap at rest is beta^2 / (4 pi^2) w N p h for a point that carries the impulse p a step.
+Source: Castro et al. 2022, "An unconstrained convex formulation of compliant contact" (SAP), section V.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax.numpy as jnp
+
+from .base import ContactModel, Law, points, recovery
+
+
+def near_rigid(beta: float) -> float:
+    return beta * beta / (4.0 * math.pi**2)
+
+
+@dataclasses.dataclass(frozen=True)
+class NearRigid(ContactModel):
+    """beta: near-rigid parameter [-]. push_speed: bound of the speed at which overlap is resolved [m/s]."""
+
+    beta: float = 0.05
+    push_speed: float = 2.0
+
+    name = "near_rigid"
+
+    def law(self, rows, w, problem) -> Law:
+        r = near_rigid(self.beta) * points(rows, w.dtype) * w
+        vhat = recovery(rows.phi, problem, 1.0, math.inf)
+        fast = vhat > self.push_speed
+        # the bound is one of speed, not of load: the force at rest stays vhat / r
+        slow = jnp.where(fast, self.push_speed / jnp.where(fast, vhat, 1.0), 1.0)
+        return Law(vhat * slow, r * slow)
+
+
+@dataclasses.dataclass(frozen=True)
+class Baumgarte(ContactModel):
+    """Rigid rows that take back a fraction of the overlap a step, up to ``push_speed`` [m/s].
+
+    Source: Baumgarte 1972. It adds energy: the speed of recovery stays in the velocities (unless the
+    solver takes it out).
+    """
+
+    fraction: float = 0.2
+    push_speed: float = 3.0
+
+    name = "baumgarte"
+    reach = "all"
+
+    def law(self, rows, w, problem) -> Law:
+        return Law(recovery(rows.phi, problem, self.fraction, self.push_speed))
