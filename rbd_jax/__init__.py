@@ -6,6 +6,7 @@
 >>> final, traj = rbd.rollout(model, rbd.batch(state, 1024), steps=1000, every=10)
 """
 
+from .audit import Audit, audit
 from .build import build
 from .contact.sdf import sdf
 from .convert import from_mujoco, to_mujoco
@@ -23,6 +24,7 @@ from .status import Status
 __version__ = "0.1.0"
 
 __all__ = [
+    "Audit",
     "Body",
     "CONTACT_MODELS",
     "Box",
@@ -40,6 +42,7 @@ __all__ = [
     "State",
     "Status",
     "Wrench",
+    "audit",
     "batch",
     "build",
     "check",

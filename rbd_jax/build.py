@@ -401,7 +401,7 @@ def _capacity(r, kind, pair, sizes, category, method: Method, scene: Scene, dt: 
     count = 0
     for start in range(0, len(pair[0]), 1_000_000):
         a, b = (side[start : start + 1_000_000] for side in pair)
-        grown = SLOP * np.minimum(half[a].min(1), half[b].min(1)) + reach[a] + reach[b]
+        grown = 0.5 * SLOP * (half[a].min(1) + half[b].min(1)) + reach[a] + reach[b]
         d = np.abs(x[b] - x[a])
         if balls:
             near = (d * d).sum(1) < (radius[a] + radius[b] + grown) ** 2

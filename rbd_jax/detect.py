@@ -29,6 +29,7 @@ from .solvers.rows import Impulses, Index, Rows, take, take_tree
 from .spatial import Quat, Vec3, safe_norm
 from .state import World
 from .struct import struct
+from .xla import materialise
 
 @struct
 class Contact:
@@ -227,6 +228,8 @@ def _group(g: Group, gp: GroupParams, p: Params, world: World, number: int, reac
         if g.choice is not None and g.category == "kinematic":
             margin = margin + take(_sweep_of(p, world), selected.body_b if g.flip else selected.body_a)
     m = manifold(g, selected, world, margin, p.one)
+    if g.choice is not None:  # the solver gathers from the rows: not the narrow phase again for each of them
+        m = m._with(**materialise(dict(normal=m.normal, point=m.point, distance=m.distance), p.one))
     if g.padding is not None:
         m = m._with(live=m.live & ~g.padding[:, None])
     rows = rows_of(g, selected, m, world)
@@ -275,11 +278,10 @@ def _choose(g: Group, gp: GroupParams, p: Params, world: World, reach):
         category = side_of(g, side)
         pose = pose_of(world, category, Index(bodies), local)
         half = half_widths(g.kind["ab".index(side)], size, pose)
-        slop = SLOP * min_size(g.kind, size, ())
-        if category == "static":
-            return Bounds(pose.x, half, slop, jnp.zeros_like(slop))
-        way = reach if category == "dynamic" else _sweep_of(p, world)
-        return Bounds(pose.x, half, slop, take(way, Index(bodies)))
+        grown = 0.5 * SLOP * min_size(g.kind, size, ())
+        if category != "static":
+            grown = grown + take(reach if category == "dynamic" else _sweep_of(p, world), Index(bodies))
+        return Bounds(pose.x, half.map(lambda c: c + grown))
 
     balls = g.kind == ("sphere", "sphere")
     a = bounds("a", c.body_a, gp.local_a, gp.size_a)

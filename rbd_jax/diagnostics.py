@@ -11,8 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .bodies import Bodies
 from .detect import detect
-from .model import Model, batch_of
+from .model import Model, Params, batch_of
 from .spatial import Vec3, pack
 from .state import State, Wrench, to_public
 from .status import MESSAGE, Status
@@ -33,14 +34,18 @@ def energy(model: Model, state: State) -> tuple[jax.Array, jax.Array]:
     Potential: - sum of m g . x of the centres of mass; contacts store none.
     """
     p, world, batch = _open(model, state)
-    b = world.bodies
+    return to_public(energies(p, world.bodies), batch)
+
+
+def energies(p: Params, b: Bodies) -> tuple[jax.Array, jax.Array]:
+    """Kinetic and potential energy of every world in the hot layout [J], (B,)."""
     kinetic = 0.5 * p.mass * b.v.dot(b.v)
     if b.L is not None:
         kinetic = kinetic + 0.5 * b.L.dot(p.inertia.velocity(b.q, b.L))
     potential = jnp.zeros_like(kinetic)
     if p.gravity is not None:
         potential = -p.mass * p.gravity.dot(b.x)
-    return to_public(kinetic.sum(axis=0), batch), to_public(potential.sum(axis=0), batch)
+    return kinetic.sum(axis=0), potential.sum(axis=0)
 
 
 def momentum(model: Model, state: State) -> tuple[jax.Array, jax.Array]:

@@ -26,7 +26,7 @@ class Method:
       integrator: a name of ``rbd_jax.integrators.INTEGRATORS`` or an instance.
       contact: contact model, a name of ``rbd_jax.CONTACT_MODELS`` ("soft", "hertz", "near_rigid", "baumgarte",
         "spring", "mujoco") or an instance; None: the solver's own.
-      solver: a name of ``rbd_jax.SOLVERS`` ("tgs", "pgs", "newton_lagged", "penalty", "mujoco") or an
+      solver: a name of ``rbd_jax.SOLVERS`` ("tgs", "pgs", "newton_lagged", "newton_cone", "penalty", "mujoco") or an
         instance. Any goes with any model, but "mujoco", which speaks its own only. None: the cheapest that stands:
         "tgs", or three Newton steps of "newton_lagged" where 2 to 64 boxes may touch each other and sweeps would need
         substeps for that, which is where dt > 1/240 s min(1, 8 / boxes) min(1, sqrt(size / 0.2 m)) or where

@@ -163,10 +163,23 @@ def free_force(p: Params, wrench: Wrench | None):
 
 def advance(model: Model, p: Params, world: World, wrench: Wrench | None) -> World:
     """One step of dt: ``substeps`` equal parts, then the step counter and the finite check."""
-    part = lambda world, _: (_substep(model, p, world, wrench), None)
+    return watched(model, p, world, wrench, None)[0]
+
+
+def watched(model: Model, p: Params, world: World, wrench: Wrench | None, watch):
+    """``advance``, and what ``watch`` returned for every substep, leaves (substeps, ...); None for no watch.
+
+    watch(old, new, problem, solution): the worlds before and after a substep and what was solved in it, both None
+    without contact; of an integrator with several stages those of the first. It adds operations of its own only.
+    """
+    part = lambda world, _: _substep(model, p, world, wrench, watch)
     count = model.method.substeps
-    new = part(world, None)[0] if count == 1 else jax.lax.scan(part, world, None, length=count)[0]
-    return _freeze(world, new, p)
+    if count == 1:
+        new, seen = part(world, None)
+        seen = jax.tree.map(lambda c: c[None], seen)
+    else:
+        new, seen = jax.lax.scan(part, world, None, length=count)
+    return _freeze(world, new, p), seen
 
 
 def _freeze(old: World, new: World, p: Params) -> World:
@@ -181,11 +194,18 @@ def _freeze(old: World, new: World, p: Params) -> World:
     return kept._with(status=status)
 
 
-def _substep(model: Model, p: Params, world: World, wrench: Wrench | None) -> World:
+def _substep(model: Model, p: Params, world: World, wrench: Wrench | None, watch):
+    """The world after a substep, and what ``watch`` says of it."""
+    new, problem, solution = _solved(model, p, world, wrench)
+    return new, None if watch is None else watch(world, new, problem, solution)
+
+
+def _solved(model: Model, p: Params, world: World, wrench: Wrench | None):
+    """The world after a substep, the contact problem in it and its solution (None without contact)."""
     s, integrator = model.structure, model.method.integrator
     if not s.groups:
         bodies = integrator.advance(world.bodies, free_force(p, wrench), p.inertia, p.h)
-        return world._with(bodies=bodies, kinematic=_prescribed(p, world.kinematic))
+        return world._with(bodies=bodies, kinematic=_prescribed(p, world.kinematic)), None, None
     if model.method.solver.level == "force":
         return _force_step(model, p, world, wrench)
     nominal = None
@@ -225,7 +245,7 @@ def _substep(model: Model, p: Params, world: World, wrench: Wrench | None) -> Wo
     if impacts is not None:
         x = x + impacts.shift
     bodies = bodies._with(x=x, v=v1, L=L1)
-    return _remember(world, bodies, p, contacts, solution, problem)
+    return _remember(world, bodies, p, contacts, solution, problem), problem, solution
 
 
 def _to_impacts(model: Model, p: Params, world: World, wrench: Wrench | None) -> tuple[World, jax.Array]:
@@ -314,7 +334,7 @@ def _prescribed(p: Params, k: Kinematic | None) -> Kinematic | None:
     return k._with(x=k.x + k.v * p.h, q=(qexp(k.w * p.h) @ k.q).normalised())
 
 
-def _force_step(model: Model, p: Params, world: World, wrench: Wrench | None) -> World:
+def _force_step(model: Model, p: Params, world: World, wrench: Wrench | None):
     """Contact as a force of the state, integrated like any other (MuJoCo's scheme)."""
     s, integrator, solver = model.structure, model.method.integrator, model.method.solver
     record = []
@@ -341,7 +361,8 @@ def _force_step(model: Model, p: Params, world: World, wrench: Wrench | None) ->
 
     force.constant = False
     bodies = integrator.advance(world.bodies, force, p.inertia, p.h)
-    return _remember(world, bodies, p, *record[0])
+    contacts, solution, problem = record[0]
+    return _remember(world, bodies, p, contacts, solution, problem), problem, solution
 
 
 def _correction(p: Params, problem: Problem, solution: Solution, v0: Vec3, v1: Vec3) -> Vec3:

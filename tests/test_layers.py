@@ -27,6 +27,7 @@ LAYER = {
     "build": 7,
     "rollout": 8,
     "diagnostics": 8,
+    "audit": 8,
     "convert": 8,
     "parity": 9,
     "record": 9,
@@ -44,6 +45,8 @@ WITHIN = {
     ("record", "view"),
     ("mjcf", "examples"),
     ("diagnostics", "rollout"),
+    ("audit", "rollout"),
+    ("audit", "diagnostics"),
     ("parity", "record"),
 }
 

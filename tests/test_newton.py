@@ -397,7 +397,7 @@ def test_lagged_closed_form(mu, e):
     for slots in (1, 2):
         rows, state = spheres(np.random.default_rng(3), 64, mu, e, slots)
         problem = make_problem([rows], state, mass, inertia, 1 / 240)
-        solver = NewtonLagged(iterations=12, slip_speed=1e-10, slip_compliance=1e-7)
+        solver = NewtonLagged(iterations=12, slip_speed=1e-10, slip_compliance=1e-7, event_beta=1e-4)
         out.append(jax.jit(solver.solve)(problem))
     assert out[0].unconverged is None and not np.asarray(out[1].unconverged).any()
     for a, b in zip(jax.tree.leaves(out[0].contacts), jax.tree.leaves(out[1].contacts)):

@@ -34,16 +34,15 @@ WORD, ROW = 32, 10
 
 @struct
 class Bounds:
-    """Bounding boxes of the geoms of one side, leaves (k, 1 or B).
-
-    x: centre, half: half-widths [m]. slop: gap that still counts as contact; the smaller of two geoms' holds.
-    reach: how far the surface may come in a step [m].
+    """Bounding boxes of the geoms of one side, leaves (k, 1 or B): centre and half-widths [m], grown by how far the
+    surface may come in a step and by half of the gap that still counts as contact. A ball has one half-width.
     """
 
     x: Vec3
     half: Vec3
-    slop: jax.Array
-    reach: jax.Array
+
+    def __len__(self) -> int:
+        return self.x.x.shape[0]
 
     def take(self, rows) -> Bounds:
         return jax.tree.map(lambda c: at(c, rows), self)
@@ -60,13 +59,11 @@ def half_widths(kind: str, size, pose: Pose) -> Vec3:
 
 def close(a: Bounds, b: Bounds, balls: bool) -> jax.Array:
     """Whether two geoms may touch within the step; ``balls``: both are spheres."""
-    grown = jnp.minimum(a.slop, b.slop) + a.reach + b.reach
-    d = b.x - a.x
+    d, reach = b.x - a.x, a.half + b.half
     if balls:
-        reach = a.half.x + b.half.x + grown
-        return d.dot(d) < reach * reach
-    gap = d.map(jnp.abs) - a.half - b.half
-    return jnp.maximum(jnp.maximum(gap.x, gap.y), gap.z) < grown
+        return d.dot(d) < reach.x * reach.x
+    d = d.map(jnp.abs)
+    return (d.x < reach.x) & (d.y < reach.y) & (d.z < reach.z)
 
 
 # --- keys ---
@@ -152,14 +149,13 @@ def all_pairs(a: Bounds, b: Bounds, balls: bool, allowed: np.ndarray | None, cap
     Returns:
       keys: int32 (C, B), ``no_key`` where a place is empty. overflow: bool (B,), there are more than C.
     """
-    count_a, count_b = a.slop.shape[0], b.slop.shape[0]
+    count_a, count_b = len(a), len(b)
     worlds = max(c.shape[1] for c in jax.tree.leaves((a, b)))
     pad = -count_a % WORD
     words = -(-count_a // WORD)
-    # bits along the slow axis: the fast ones (geoms of B, worlds) are vectors
-    a = a._with(half=a.half.map(lambda c: jnp.pad(c, ((0, pad), (0, 0)), constant_values=-jnp.inf)))
-    fit = lambda c: (c if c.shape[0] > count_a or not pad else jnp.pad(c, ((0, pad), (0, 0))))
-    a = jax.tree.map(lambda c: fit(c).reshape(words, WORD, 1, c.shape[1]), a)
+    # bits along the slow axis: the fast ones (geoms of B, worlds) are vectors; what is padded is infinitely far
+    fit = lambda c: jnp.pad(c, ((0, pad), (0, 0)), constant_values=jnp.inf).reshape(words, WORD, 1, c.shape[1])
+    a = Bounds(a.x.map(fit), a.half.map(lambda c: jnp.pad(c, ((0, pad), (0, 0))).reshape(words, WORD, 1, c.shape[1])))
     b = jax.tree.map(lambda c: c[None, None], b)
     found = jnp.broadcast_to(close(a, b, balls), (words, WORD, count_b, worlds))
     weight = (np.uint32(1) << np.arange(WORD, dtype=np.uint32))[None, :, None, None]
@@ -179,8 +175,7 @@ def grid_pairs(a: Bounds, b: Bounds | None, balls: bool, allowed: np.ndarray | N
     """As ``all_pairs``; b None: the pairs i < j of one list of geoms."""
     worlds = max(c.shape[1] for c in jax.tree.leaves((a, b)))
     a, b = jax.tree.map(lambda c: jnp.broadcast_to(c, (c.shape[0], worlds)), (a, b))
-    wide = lambda s: s.half.map(lambda h: h + s.slop + s.reach)
-    halves = [wide(s) for s in (a, b) if s is not None]
+    halves = [s.half for s in (a, b) if s is not None]
     cells_a, cells_b = [], []
     for axis in "xyz":
         half = [getattr(h, axis).max(axis=0) for h in halves]
@@ -195,7 +190,7 @@ def grid_pairs(a: Bounds, b: Bounds | None, balls: bool, allowed: np.ndarray | N
         cells_a.append(number(position))
         cells_b.append(None if b is None else number(getattr(b.x, axis)))
     code = lambda c: (c[0] * 2**ROW + c[1]) * 2**ROW + c[2]
-    count = a.slop.shape[0]
+    count = len(a)
     own = jnp.broadcast_to(jnp.arange(count, dtype=jnp.int32)[:, None], (count, worlds))
     cell_a, order = jax.lax.sort((code(cells_a), own), dimension=0, num_keys=1)
     side = lambda dx, dy: (dx * 2**ROW + dy) * 2**ROW
@@ -224,7 +219,7 @@ def grid_pairs(a: Bounds, b: Bounds | None, balls: bool, allowed: np.ndarray | N
     else:
         i, j = other, mine
     found = close(a.take(i), b.take(j), balls) & (place < ends[-1])
-    count_b = b.slop.shape[0]
+    count_b = len(b)
     if allowed is not None:
         word = jnp.asarray(allowed).reshape(-1)[i // WORD * count_b + j]
         found = found & ((word >> (i % WORD).astype(jnp.uint32)) & 1).astype(bool)

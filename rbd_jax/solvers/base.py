@@ -6,6 +6,7 @@ import dataclasses
 from typing import ClassVar
 
 import jax
+import jax.numpy as jnp
 
 from ..bodies import Inertia
 from ..spatial import Quat, Vec3
@@ -70,6 +71,13 @@ class Solution:
     overflow: jax.Array | None = None
     warm: bool = static(default=True)
 
+    def velocities(self, problem: Problem) -> tuple[Vec3, Vec3 | None]:
+        """Velocities at the end of the step, at the inertia of its start."""
+        v = problem.v + self.impulse * problem.inv_mass
+        if problem.w is None:
+            return v, None
+        return v, problem.w + problem.inv_inertia @ self.angular_impulse
+
 
 @dataclasses.dataclass(frozen=True)
 class Solver:
@@ -89,3 +97,19 @@ class Solver:
 
     def solve(self, problem: Problem) -> Solution:
         raise NotImplementedError
+
+    def final_law(self, rows: Rows, p: Impulses, w: jax.Array, problem: Problem, solution: Solution):
+        """The ``laws.Law`` that impulses and end-of-step velocities of a group obey where this solver has converged.
+
+        An impact with restitution hits its target velocity rigidly. ``p``: the impulses of the group; ``w`` as in
+        ``ContactModel.law``. Only ``residuals`` asks.
+        """
+        from .laws import contact_model
+        from .restitution import targets
+
+        law = contact_model(self, problem).law(rows, w, problem)
+        if rows.e is None:
+            return law
+        events = targets(rows, problem)
+        r = None if law.r is None else jnp.where(events.active, 0.0, law.r)
+        return law._with(vhat=events.target(law.vhat), r=r)

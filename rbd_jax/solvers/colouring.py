@@ -116,7 +116,7 @@ def colour(b: jax.Array, a: jax.Array | None, live: jax.Array, n: int) -> jax.Ar
             if a is not None:
                 free = free & ~used[a, column]
             open_ = live & (hue == COLOURS) & (free != 0)
-            start = _mixed(salt + k) % choices
+            start = (_mixed(salt + k) >> 16) * choices >> 16
             later = free & (jnp.uint32(0xFFFFFFFF) << start)
             bit = jnp.where(later != 0, later, free)
             bit = bit & (~bit + 1)

@@ -367,7 +367,7 @@ def _diagonal_blocks(c: Contacts, g: Sym3 | Sym6, r: Vec3 | None, one):
         n = components(c.n)
         return [[n[i] * n[j] * gn for j in range(3)] for i in range(3)], None, None
     m = _full(g)
-    cross = g.cross if isinstance(g, Sym6) else _NONE
+    cross = g.cross if isinstance(g, Sym6) else UNCOUPLED
     k = _rotate(c, materialise([[None if x is None else x.sum(0) for x in row] for row in m], one), one)
     if r is None:
         return k, None, None
@@ -394,7 +394,7 @@ def _slots(x):
     return None if x is None else x.sum(0)
 
 
-_NONE = ((None,) * 3,) * 3
+UNCOUPLED = ((None,) * 3,) * 3
 
 
 def _full(g: Sym3 | Sym6):

@@ -4,6 +4,7 @@ The end-of-step velocities minimise (v - v*)' M (v - v*) / 2 + sum_c l_c(J_c v),
 
     normal    p_n = max((vhat - u_n) / R, 0)                R, vhat of the contact model
     friction  p_t = -mu g0 u_t / D,  D = sqrt(|u_t|^2 + eps^2),  eps = max(v_s, mu sigma w g0)
+    couples   p_s = -nu g0 s / D_s,  D_s = sqrt(s^2 + (mu eps / nu)^2), s spin about n (torsion) or across it (rolling)
 
 Symbols: u relative velocity of a point; w inverse mass seen by its normal row; N number of live points of
 the pair; g0 the normal impulse that bounds friction, frozen while the problem is solved. R is at least
@@ -37,8 +38,8 @@ from ..struct import struct
 from ..xla import materialise
 from . import dense
 from .base import Problem, Solution, Solver
-from .dense import Contacts, Sym3
-from .laws import contact_model
+from .dense import Contacts, Sym3, Sym6
+from .laws import Law, contact_model
 from .laws.base import points
 from .laws.near_rigid import near_rigid
 from .restitution import targets
@@ -66,6 +67,7 @@ class NewtonLagged(Solver):
 
     name = "newton_lagged"
     contact = "near_rigid"
+    spins = True
 
     def __post_init__(self):
         if self.iterations < 2:
@@ -115,8 +117,14 @@ class NewtonLagged(Solver):
             events = targets(rows, problem)
             vhat = events.target(vhat)
             r = jnp.where(events.active, least, r)
-        law = _Law(w=w, r=r, vhat=vhat, points=count, mu=rows.mu)
+        law = _Law(w=w, r=r, vhat=vhat, points=count, mu=rows.mu, mu_spin=rows.mu_spin, mu_roll=rows.mu_roll)
         return materialise(law, problem.one)
+
+    def final_law(self, rows: Rows, p: Impulses, w, problem: Problem, solution: Solution) -> Law:
+        law = self._law(
+            dense.contacts(rows, problem), rows, problem, 0.0 if _single_sphere(problem) else self.event_beta
+        )
+        return Law(law.vhat, law.r)
 
     def _linearise(self, c: Contacts, law: _Law, bound, p: Impulses, u: Impulses) -> tuple[Impulses, Sym3]:
         """Base and Hessian of the linear model p' = base - G du."""
@@ -125,28 +133,26 @@ class NewtonLagged(Solver):
         gn = jnp.where(active, 1.0, 0.0) / law.r
         if not c.friction:
             return Impulses(gn * gap), Sym3(gn)
-        limit, d = self._friction(law, bound, u)
-        limit = jnp.where(c.live, limit, 0.0)
-        m = limit / d
-        # p_t inside the cone (so that the symmetric part stays positive), as a fraction of the bound over D
-        q = p.t1 * p.t1 + p.t2 * p.t2
-        outside = q > limit * limit
-        size = jnp.where(outside, jnp.sqrt(jnp.where(outside, q, 1.0)), jnp.where(limit > 0, limit, 1.0))
-        s = jnp.where(limit > 0, 1.0, 0.0) / (size * d)
-        f1, f2 = p.t1 * s, p.t2 * s
-        g = Sym3(
-            gn,
-            xx=m * (1.0 + f1 * u.t1),
-            yy=m * (1.0 + f2 * u.t2),
-            xy=0.5 * m * (f1 * u.t2 + f2 * u.t1),
-        )
-        return Impulses(gn * gap, -m * u.t1, -m * u.t2), g
+        bound = jnp.where(c.live, bound, 0.0)
+        limit, eps = self._friction(law, bound)
+        base, (xx, yy, xy) = _drag(limit, _inverse_speed(u.t1, u.t2, eps), (p.t1, p.t2), (u.t1, u.t2))
+        base, g = Impulses(gn * gap, *base), Sym3(gn, xx=xx, yy=yy, xy=xy)
+        if not c.torsion:
+            return base, g
+        # couples: the same law for the velocity nu w / mu, so that a coefficient nu [m] of zero is no special case
+        nu = law.mu_spin
+        (s,), (zz,) = _drag(nu * bound, nu * _inverse_speed(nu * u.s, 0.0, law.mu * eps), (p.s,), (u.s,))
+        if not c.rolling:
+            return base._with(s=s), Sym6(g, dense.UNCOUPLED, Sym3(zz))
+        nu = law.mu_roll
+        inverse = nu * _inverse_speed(nu * u.r1, nu * u.r2, law.mu * eps)
+        (r1, r2), (xx, yy, xy) = _drag(nu * bound, inverse, (p.r1, p.r2), (u.r1, u.r2))
+        return base._with(s=s, r1=r1, r2=r2), Sym6(g, dense.UNCOUPLED, Sym3(zz, xx=xx, yy=yy, xy=xy))
 
-    def _friction(self, law: _Law, bound, u: Impulses):
-        """mu g0 and D."""
+    def _friction(self, law: _Law, bound):
+        """mu g0 and eps."""
         limit = law.mu * bound
-        eps = jnp.maximum(self.slip_compliance * law.w * limit, self.slip_speed)
-        return limit, jnp.sqrt(u.t1 * u.t1 + u.t2 * u.t2 + eps * eps)
+        return limit, jnp.maximum(self.slip_compliance * law.w * limit, self.slip_speed)
 
     def _unconverged(self, cs, laws, bounds, ps, us, frees) -> jax.Array:
         worst = scale = 0.0
@@ -154,8 +160,9 @@ class NewtonLagged(Solver):
             r = jnp.abs(law.w * p.n - jnp.maximum(law.w * p.n + law.vhat - u.n - law.r * p.n, 0.0))
             speed = jnp.maximum(jnp.abs(free.n), jnp.abs(law.vhat))
             if c.friction:
-                limit, d = self._friction(law, bound, u)
-                e1, e2 = p.t1 + limit * u.t1 / d, p.t2 + limit * u.t2 / d
+                limit, eps = self._friction(law, bound)
+                drag = limit * _inverse_speed(u.t1, u.t2, eps)
+                e1, e2 = p.t1 + drag * u.t1, p.t2 + drag * u.t2
                 r = jnp.maximum(r, law.w * jnp.maximum(jnp.abs(e1), jnp.abs(e2)))
                 speed = jnp.maximum(speed, jnp.maximum(jnp.abs(free.t1), jnp.abs(free.t2)))
             worst = jnp.maximum(worst, jnp.where(c.live, r, 0.0).max(axis=(0, 1)))
@@ -194,6 +201,27 @@ class _Law:
     vhat: jax.Array
     points: jax.Array
     mu: jax.Array | None
+    mu_spin: jax.Array | None = None
+    mu_roll: jax.Array | None = None
+
+
+def _inverse_speed(a, b, eps) -> jax.Array:
+    """1 / D of friction rows with velocities a, b."""
+    return 1.0 / jnp.sqrt(a * a + b * b + eps * eps)
+
+
+def _drag(limit, inverse, p: tuple, u: tuple):
+    """Base and Hessian of the rows D p + limit u = 0 linearised in both, for one or two rows: (xx,) or (xx, yy, xy)."""
+    m = limit * inverse
+    # p inside the disc (so that the symmetric part stays positive), as a fraction of the limit over D
+    q = sum(x * x for x in p)
+    outside = q > limit * limit
+    size = jnp.where(outside, jnp.sqrt(jnp.where(outside, q, 1.0)), jnp.where(limit > 0, limit, 1.0))
+    s = jnp.where(limit > 0, inverse, 0.0) / size
+    f = tuple(x * s for x in p)
+    own = tuple(m * (1.0 + a * b) for a, b in zip(f, u))
+    off = (0.5 * m * (f[0] * u[1] + f[1] * u[0]),) if len(p) == 2 else ()
+    return tuple(-m * x for x in u), own + off
 
 
 def _single_sphere(problem: Problem) -> bool:
@@ -204,6 +232,8 @@ def _single_sphere(problem: Problem) -> bool:
     alone = rows.a is None and rows.slots == 1 and rows.central_b
     if not alone or not isinstance(rows.b, Index) or len(np.unique(rows.b.rows)) != len(rows.b):
         return False
+    if rows.mu_spin is not None:
+        return False
     return rows.mu is None or problem.w is None or problem.inertia.isotropic
 
 
@@ -211,7 +241,7 @@ def _start(c: Contacts, warm: Impulses) -> Impulses:
     live = lambda x: jnp.where(c.live, x, 0.0)
     if not c.friction:
         return Impulses(live(jnp.maximum(warm.n, 0.0)))
-    return Impulses(live(jnp.maximum(warm.n, 0.0)), live(warm.t1), live(warm.t2))
+    return jax.tree.map(live, warm)._with(n=live(jnp.maximum(warm.n, 0.0)))
 
 
 def _bound(law: _Law, warm, free: Impulses):

@@ -11,11 +11,15 @@ from __future__ import annotations
 
 import dataclasses
 
+import jax.numpy as jnp
+
 from ..xla import materialise
 from . import single
 from .base import Problem, Solution, Solver
 from .gauss_seidel import apply, arranged, biased, prepare, relaxing, solution, sweep
-from .laws import contact_model
+from .laws import Law, contact_model
+from .restitution import normal_velocity, targets
+from .rows import Impulses, Rows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,3 +65,23 @@ class TGS(Solver):
             for k, g in enumerate(groups):
                 body, lam[k] = sweep(g, hard[k], lam[k], body, one)
         return solution(problem, groups, body, lam, moving)
+
+    def final_law(self, rows: Rows, p: Impulses, w, problem: Problem, solution: Solution) -> Law:
+        """That of the relaxing sweeps: no bias on overlap, gaps as they are after the move.
+
+        A gap that carries nothing at the end binds the velocity of the move, not that of the end.
+        """
+        model = contact_model(self, problem)
+        if model.physical:
+            return super().final_law(rows, p, w, problem, solution)
+        v, w_end = solution.velocities(problem)
+        end = normal_velocity(rows, v, w_end)
+        moved = normal_velocity(rows, solution.v_move, w_end if solution.w_move is None else solution.w_move)
+        closes = -rows.phi / problem.h
+        vhat = jnp.where(rows.phi <= 0, 0.0, jnp.minimum(closes - moved, 0.0))
+        idle = (rows.phi > 0) & (p.n <= 0)
+        if rows.e is None:
+            return Law(jnp.where(idle, closes + end - moved, vhat))
+        events = targets(rows, problem)
+        vhat = jnp.where(idle, jnp.minimum(closes, events.bound) + end - moved, vhat)
+        return Law(jnp.where(events.active, events.vhat, vhat))

@@ -52,6 +52,16 @@ class ContactModel:
         """The law of one group; ``w`` [1/kg] (S, P, B) is the inverse mass seen by each normal row."""
         raise NotImplementedError
 
+    def energy(self, rows: Rows, w: jax.Array, problem) -> jax.Array | None:
+        """Elastic energy of the overlap of every slot [J] (S, P, B), None where the model stores none."""
+        return None
+
+
+def spring_energy(stiffness, overlap: jax.Array) -> jax.Array:
+    """k x^2 / 2 [J] of a spring that is compressed by ``overlap`` [m]."""
+    x = jnp.maximum(overlap, 0.0)
+    return 0.5 * stiffness * x * x
+
 
 def points(rows: Rows, dtype) -> jax.Array:
     """Number of live points of every pair, at least 1: they share its load. (P, B)."""

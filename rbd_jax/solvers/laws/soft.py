@@ -12,7 +12,7 @@ import math
 
 import jax.numpy as jnp
 
-from .base import ContactModel, Law, points, recovery
+from .base import ContactModel, Law, points, recovery, spring_energy
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,3 +55,7 @@ class Hertz(ContactModel):
         both = 2.0 * self.damping_ratio + om
         vhat = recovery(rows.phi, problem, om / both, self.push_speed)
         return Law(vhat, w * points(rows, w.dtype) / (om * both))
+
+    def energy(self, rows, w, problem):
+        om = 2.0 * math.pi * self.hertz
+        return spring_energy(om * om / (w * points(rows, w.dtype)), -rows.phi)

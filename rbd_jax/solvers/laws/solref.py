@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from ..mujoco_law import impedance, stiffness_damping
 from ..restitution import normal_velocity
 from ..rows import take
-from .base import ContactModel, Law
+from .base import ContactModel, Law, spring_energy
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,9 +26,7 @@ class Solref(ContactModel):
 
     def law(self, rows, w, problem) -> Law:
         law, h = rows.law, problem.h
-        weight = take(problem.inv_mass, rows.b)
-        if rows.a is not None:
-            weight = weight + take(problem.inv_mass, rows.a)
+        weight = _weight(rows, problem)
         d = impedance(law, rows.phi)
         k, b = stiffness_damping(law, h, law.timeconst, law.dampratio)
         u = normal_velocity(rows, problem.v0, problem.w0)
@@ -38,3 +36,17 @@ class Solref(ContactModel):
             _, bt = stiffness_damping(law, h, law.timeconst_friction, law.dampratio_friction)
         vhat = u - h * (b * u + k * d * (rows.phi - law.margin))
         return Law(vhat, compliance, compliance / law.impratio, 1.0 - h * bt)
+
+    def energy(self, rows, w, problem):
+        """Of the spring k d / R that carries a load at rest, from the margin on; its change of d is left out."""
+        law = rows.law
+        d = impedance(law, rows.phi)
+        k, _ = stiffness_damping(law, problem.h, law.timeconst, law.dampratio)
+        compliance = jnp.maximum((1.0 - d) / d * _weight(rows, problem), 1e-15)
+        return spring_energy(k * d / compliance, law.margin - rows.phi)
+
+
+def _weight(rows, problem):
+    """Inverse mass of a pair as MuJoCo scales its compliance with [1/kg]."""
+    weight = take(problem.inv_mass, rows.b)
+    return weight if rows.a is None else weight + take(problem.inv_mass, rows.a)

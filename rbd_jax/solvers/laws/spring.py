@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
-from .base import ContactModel, Law, points
+from .base import ContactModel, Law, points, spring_energy
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,3 +35,6 @@ class Spring(ContactModel):
         slow = problem.h + self.relaxation
         compliance = 1.0 / (problem.h * self.stiffness * slow)
         return Law(-rows.phi / slow, points(rows, w.dtype) * compliance + 0.0 * w)
+
+    def energy(self, rows, w, problem):
+        return spring_energy(self.stiffness / points(rows, w.dtype), -rows.phi)

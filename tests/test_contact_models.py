@@ -1,0 +1,122 @@
+"""Contact models with every solver: the overlap and the friction that the law of each says."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import rbd_jax as rbd
+from rbd_jax.solvers.laws import Hertz, NearRigid, Spring
+
+G, H = 9.81, 1 / 240
+SOLVERS = ["tgs", "pgs", "newton_lagged", "newton_cone", "penalty"]
+
+
+@pytest.fixture(autouse=True)
+def double():
+    with jax.enable_x64(True):
+        yield
+
+
+def resting(half=0.1, mass=8.0):
+    body = rbd.Body("cube", rbd.Box((half, half, half)), pos=(0, 0, half), mass=mass, friction=0.5)
+    return rbd.Scene([body], [rbd.Geom(rbd.Plane(), friction=0.5)], dt=H)
+
+
+def overlap(method, steps=720):
+    model, state = rbd.build(resting(), method=method)
+    final, _ = rbd.rollout(model, state, steps, every=steps)
+    assert np.abs(final.vel).max() < 1e-6 and int(final.status) == 0
+    return 0.1 - float(final.pos[0, 2])
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_spring_yields_by_its_load(solver):
+    """m g / k, whatever the solver and however many points share the load."""
+    spring = Spring(stiffness=2e4, relaxation=0.02)
+    assert overlap(rbd.Method("symtop2", spring, solver)) == pytest.approx(8.0 * G / 2e4, rel=1e-3)
+
+
+@pytest.mark.parametrize("solver", ["tgs", "newton_lagged"])
+def test_a_contact_of_a_frequency_yields_by_its_period(solver):
+    """g / (2 pi f)^2 times m w, where w = 4 / m is the inverse mass that a corner of a cube has."""
+    assert overlap(rbd.Method("symtop2", Hertz(hertz=15.0), solver)) == pytest.approx(
+        4 * G / (2 * np.pi * 15) ** 2, rel=1e-3
+    )
+
+
+def test_a_near_rigid_contact_yields_by_beta():
+    beta = 0.2
+    expected = beta**2 / (4 * np.pi**2) * 4 * G * H**2
+    assert overlap(rbd.Method("symtop2", NearRigid(beta=beta), "newton_lagged")) == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("solver", ["newton_lagged", "newton_cone", "pgs"])
+def test_mujocos_softness_at_the_velocity_level(solver):
+    """The overlap of the preset "mujoco", whose law it is."""
+    assert overlap(rbd.Method("symtop2", "mujoco", solver)) == pytest.approx(overlap("mujoco"), rel=2e-2)
+
+
+@pytest.mark.parametrize("method", ["accurate", rbd.Method(solver="newton_cone")], ids=["newton_lagged", "newton_cone"])
+def test_torsional_and_rolling_friction_slow_a_ball(method):
+    """Spin about the normal falls by nu_s m g / I, rolling by nu_r g / (1.4 r)."""
+    numbers = dict(friction=0.5, torsional_friction=0.02, rolling_friction=0.005)
+    ball = lambda name, **kwargs: rbd.Body(name, [rbd.Geom(rbd.Sphere(0.1), **numbers)], mass=1.0, **kwargs)
+    bodies = [
+        ball("spins", pos=(0, 0, 0.1), omega=(0, 0, 10.0)),
+        ball("rolls", pos=(1, 0, 0.1), vel=(1.0, 0, 0), omega=(0, 10.0, 0)),
+    ]
+    model, state = rbd.build(rbd.Scene(bodies, [rbd.Geom(rbd.Plane(), **numbers)], dt=1 / 500), method=method)
+    final, traj = rbd.rollout(model, state, 150, every=100)
+    spin = 10 - 0.02 * G / (0.4 * 0.01) * 0.2
+    assert float(traj.omega[1, 0, 2]) == pytest.approx(spin, abs=0.015)
+    assert float(final.omega[0, 2]) == pytest.approx(0.0, abs=1e-3)
+    assert float(traj.vel[1, 1, 0]) == pytest.approx(1 - 0.005 * G / 0.14 * 0.2, abs=3e-3)
+
+
+def test_the_exit_speed_from_overlap_is_bounded():
+    """Cubes placed half inside each other part at ``push_speed`` at most, and no heavier load is refused."""
+    for preset in ("accurate", rbd.Method(solver="tgs")):
+        bodies = [rbd.Body(f"c{i}", rbd.Box((0.5, 0.5, 0.5)), pos=(0.0, 0, 0.5 * i)) for i in range(2)]
+        model, state = rbd.build(rbd.Scene(bodies, gravity=None, dt=1 / 60), method=preset)
+        _, traj = rbd.rollout(model, state, 60)
+        speed = np.diff(np.asarray(traj.vel)[:, :, 2], axis=1)
+        assert 0.1 < speed.max() <= 2.0 + 1e-9
+
+
+@pytest.mark.parametrize(
+    "method, message",
+    [
+        (rbd.Method(contact="jelly"), "unknown contact model 'jelly'"),
+        (rbd.Method(solver="magic"), "unknown solver 'magic'"),
+        (rbd.Method(contact="soft", solver="mujoco"), "speaks contact model 'mujoco'"),
+        (rbd.Method(contact=3), "must be a name or a ContactModel"),
+        (rbd.Method(substeps=0), "substeps = 0"),
+    ],
+)
+def test_combinations_that_do_not_exist_are_refused(method, message):
+    with pytest.raises(ValueError, match=message):
+        rbd.build(resting(), method=method)
+    with pytest.raises(ValueError, match="Spring"):
+        Spring(stiffness=-1.0)
+
+
+def test_fast_picks_the_cheapest_solver_that_stands():
+    """Sweeps for bodies on the ground and small stacks in small steps, else a direct solve."""
+
+    def solver(n, dt, half=0.5, heavy=1.0):
+        box = lambda i: rbd.Body(
+            f"b{i}", rbd.Box((half, half, half)), pos=(0, 0, half * (2 * i + 1)), mass=heavy if i else 1.0
+        )
+        scene = rbd.Scene([box(i) for i in range(n)], [rbd.Geom(rbd.Plane())])
+        return rbd.build(scene, dt=dt, method="fast")[0].method.solver.name
+
+    assert [solver(1, 1 / 60), solver(5, 1 / 240), solver(10, 1 / 60), solver(2, 1 / 500, heavy=100.0)] == [
+        "tgs",
+        "tgs",
+        "newton_lagged",
+        "newton_lagged",
+    ]
+    chosen = rbd.build(resting(), dt=1 / 60, method=dataclasses.replace(rbd.PRESETS["fast"], substeps=3))[0].method
+    assert (chosen.solver.name, chosen.substeps) == ("tgs", 3)
