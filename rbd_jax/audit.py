@@ -9,10 +9,9 @@ from .bodies import Bodies
 from .detect import detect
 from .diagnostics import energies
 from .model import Model, Params, batch_of
-from .rollout import _batched_call, _check_state, _check_wrench, _hot_wrench
+from .rollout import _batched_call, _check_state, _check_wrench, _hot_wrench, _step
 from .solvers import dense
 from .solvers.residuals import WORST, nothing, residuals
-from .spatial import Vec3
 from .state import State, World, Wrench, to_public
 from .step import FROZEN, _problem, enter, leave, watched, with_memory
 from .struct import struct
@@ -22,26 +21,26 @@ from .struct import struct
 class Audit:
     """What a step did in every world, leaves (...).
 
-    Residuals, the worst of all contact points and substeps (``solvers.residuals`` has the formulas and sources), against
-    the law that the contact model sets, compliance and restitution included:
+    Residuals, the worst of all contact points and substeps (formulas and sources: ``solvers.residuals``), against the
+    law that the contact model sets, compliance and restitution included:
 
       signorini: gap speed against impulse response [m/s]. complementarity: impulse times gap speed [J].
       cone: friction impulse beyond mu times the normal one [N s].
       dissipation: power of friction against the most that the cone allows, over the step [J].
       momentum: impulse that a body received against the impulses of its contact points [N s].
 
-    Contacts: points: how many carried an impulse in the last substep, int32. penetration, mean_penetration: deepest, and
-    mean over the points that overlap, at the end of the step [m].
+    Contacts: points: how many carried an impulse in the last substep, int32. penetration, mean_penetration: deepest,
+    and mean over the points that overlap, at the end of the step [m].
 
-    Energy ledger [J]: kinetic, potential (- sum of m g . x), stored (elastic energy of overlap of models whose compliance
-    is the material's: "hertz", "spring", "mujoco"; else 0) at the end of the step, and over the step
+    Energy ledger [J]: kinetic, potential (- sum of m g . x) and stored at the end of the step; stored is the elastic
+    energy of overlap where the compliance is the material's ("hertz", "spring", "mujoco"), else 0. Over the step
 
-      work + dissipated + change of (kinetic + potential + stored) = 0 with work counted as given to the bodies:
-      dissipated = work - change.
+      dissipated = work - change of (kinetic + potential + stored)
+                 = dissipated_friction + dissipated_normal + drag + error of the integrator
 
-      work: of the control and of kinematic surfaces. dissipated: what is left, so it holds drag and the error of the
-      integrator too. dissipated_friction, dissipated_normal: parts of it that the friction rows and the normal rows take.
-      What a compliant model stores is in dissipated_normal while it loads, with the opposite sign in ``stored``.
+      work: of the control and of kinematic surfaces. dissipated_friction, dissipated_normal: what the friction rows and
+      the normal rows take, from their impulses: an impact with restitution at its instant, others at the middle of the
+      substep (so an inelastic landing is known to m g h |v|; ``dissipated`` itself has no such error).
     """
 
     signorini: jax.Array
@@ -68,18 +67,22 @@ def audit(model: Model, state: State, control=None) -> tuple[State, Audit]:
       model, state, control: as for :func:`rbd_jax.step`.
 
     Returns:
-      The state after the step, as :func:`rbd_jax.step` gives it, and an :class:`Audit`.
+      The state after the step, bit for bit that of :func:`rbd_jax.step` (inside a program of your own as XLA compiles
+      that program, as ``step`` is), and an :class:`Audit`.
 
     The work of a torque is that of the mean of the angular velocities before and after a substep. With
-    ``Method.events`` residuals, ``points``, ``dissipated_*`` and the work of kinematic surfaces are those of what the
-    impacts left of the step; the other entries are of all of it. A frozen world made no step: its residuals, work and
-    dissipation are 0.
+    ``Method.events`` residuals, ``points``, ``dissipated_friction``, ``dissipated_normal`` and the work of kinematic
+    surfaces are those of what the impacts left of the step, the other entries of all of it. A frozen world made no
+    step: its residuals, ``points``, work and dissipation are 0.
     """
     _check_state(model, state)
     if callable(control):
         control = control(model, state)
     _check_wrench(model, state, control)
-    return _audit(model, with_memory(model, state), control)
+    given = (model, with_memory(model, state), control)
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(given)):
+        return _audit(*given)
+    return _step(*given), _audit(*given)[1]  # XLA rounds differently in a larger program
 
 
 @jax.jit
@@ -98,23 +101,23 @@ def _audit_batch(model: Model, state: State, wrench: Wrench | None) -> tuple[Sta
         seen = nothing(worlds, dtype) if problem is None else residuals(model.method.solver, problem, solution)
         turned = jnp.zeros(worlds, dtype)
         if wrench is not None and wrench.torque is not None and before.bodies.L is not None:
-            w = p.inertia.velocity(before.bodies.q, before.bodies.L) + p.inertia.velocity(after.bodies.q, after.bodies.L)
-            turned = turned + (0.5 * p.h * wrench.torque.dot(w)).sum(axis=0)
+            first, last = (p.inertia.velocity(b.q, b.L) for b in (before.bodies, after.bodies))
+            turned = turned + (0.5 * p.h * wrench.torque.dot(first + last)).sum(axis=0)
         return seen, turned
 
     new, (seen, turned) = watched(model, p, old, wrench, watch)
     lost = (new.status & jnp.uint32(FROZEN)) != 0
     keep = lambda x: jnp.where(lost, jnp.zeros_like(x), x)
     worst = {name: keep(getattr(seen, name).max(axis=0)) for name in (*WORST, "momentum")}
-    total = lambda x: keep(x.sum(axis=0))
 
     kinetic, potential = energies(p, new.bodies)
     change = _change(p, old.bodies, new.bodies)
     deepest, mean, stored = _overlap(model, p, new)
+    loaded = 0.0
     if stored is None:
         stored = jnp.zeros(worlds, dtype)
     else:
-        change = change + stored - _overlap(model, p, old)[2]
+        loaded = stored - _overlap(model, p, old)[2]
     work = turned.sum(axis=0) + seen.surfaces.sum(axis=0)
     if wrench is not None and wrench.force is not None:
         work = work + wrench.force.dot(new.bodies.x - old.bodies.x).sum(axis=0)
@@ -127,9 +130,9 @@ def _audit_batch(model: Model, state: State, wrench: Wrench | None) -> tuple[Sta
         potential=potential,
         stored=stored,
         work=keep(work),
-        dissipated=keep(work - change),
-        dissipated_friction=total(seen.friction),
-        dissipated_normal=total(seen.normal),
+        dissipated=keep(work - change - loaded),
+        dissipated_friction=keep(seen.friction.sum(axis=0)),
+        dissipated_normal=keep(seen.normal.sum(axis=0) - loaded),
     )
     full = lambda x: jnp.broadcast_to(x, (worlds,))
     return leave(model, p, new, batch), to_public(jax.tree.map(full, account), batch)

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 
 from .bodies import Bodies, Inertia
 from .contact import NARROW, Pose
-from .detect import Selected, everything, manifold, min_size, pick, place, rows_of, side_of
+from .detect import Selected, manifold, min_size, pick, place, rows_of, side_of
 from .model import Group, Model, Params
 from .solvers.base import Problem
 from .solvers.gauss_seidel import Sweep, prepare, sweep
@@ -50,10 +50,13 @@ class Flight:
     free: jax.Array  # |a| without contact
 
 
-def advance_to_impacts(model: Model, p: Params, world: World, a: Vec3 | None, tau: Vec3 | None, support):
-    """Every world at its last impact of this step, and the time that is left of the step [s], (B,).
+def advance_to_impacts(
+    model: Model, p: Params, world: World, selected: tuple[Selected, ...], a: Vec3 | None, tau: Vec3 | None, support
+):
+    """Every world at its last impact of this step, the time that is left of the step [s], (B,), and the pairs of
+    every group that meet in that time nevertheless (P, B): there were more impacts than events.
 
-    a, tau: acceleration and torque of all forces but contact; support: (impulse, angular impulse) that the
+    selected: the pairs of every group that may touch in the step. a, tau: acceleration and torque of all forces but contact; support: (impulse, angular impulse) that the
     contacts gave in the last step.
     """
     zero = zeros_like(world.bodies.v)
@@ -63,8 +66,7 @@ def advance_to_impacts(model: Model, p: Params, world: World, a: Vec3 | None, ta
     a = a + push * (p.inv_mass / p.h)
     if world.bodies.L is not None:
         tau = (zeros_like(a) if tau is None else tau) + turn * (1.0 / p.h)
-    groups = tuple(zip(model.structure.groups, p.groups))
-    selected = tuple(everything(g, gp) for g, gp in groups)
+    groups = model.structure.groups
     step = jnp.broadcast_to(p.h, world.step.shape).astype(zero.x.dtype)
     last = jnp.finfo(zero.x.dtype).eps ** 0.5 * step
 
@@ -72,7 +74,7 @@ def advance_to_impacts(model: Model, p: Params, world: World, a: Vec3 | None, ta
         bodies, kinematic, left = carry
         world_now = world._with(bodies=bodies, kinematic=kinematic)
         flight = Flight(bodies, a, tau, free)
-        hits = [_first(model, p, g, sel, world_now, flight, left - last) for (g, _), sel in zip(groups, selected)]
+        hits = [_soonest(_search(model, p, g, sel, world_now, flight, left - last)) for g, sel in zip(groups, selected)]
         soonest = hits[0][0]
         for t, _ in hits[1:]:
             soonest = jnp.minimum(soonest, t)
@@ -82,7 +84,7 @@ def advance_to_impacts(model: Model, p: Params, world: World, a: Vec3 | None, ta
         bodies = jax.tree.map(lambda new, old: jnp.where(any_hit, new, old), moved, bodies)
         kinematic = _carried(kinematic, t)
         free_hit = any_hit
-        for (g, _), sel, (mine, where_) in zip(groups, selected, hits):
+        for g, sel, (mine, where_) in zip(groups, selected, hits):
             wins = free_hit & (mine == soonest)
             free_hit = free_hit & ~wins
             world_now = world._with(bodies=bodies, kinematic=kinematic)
@@ -91,7 +93,10 @@ def advance_to_impacts(model: Model, p: Params, world: World, a: Vec3 | None, ta
 
     carry = (world.bodies, world.kinematic, step)
     (bodies, kinematic, left), _ = jax.lax.scan(event, carry, length=model.method.events)
-    return world._with(bodies=bodies, kinematic=kinematic), left
+    world = world._with(bodies=bodies, kinematic=kinematic)
+    flight = Flight(bodies, a, tau, free)
+    more = tuple(jnp.isfinite(_search(model, p, g, sel, world, flight, left)) for g, sel in zip(groups, selected))
+    return world, left, more
 
 
 def _fly(model: Model, inertia: Inertia | None, f: Flight, t) -> Bodies:
@@ -123,8 +128,14 @@ def _tolerance(g: Group, selected: Selected) -> jax.Array:
     return jnp.finfo(size.dtype).eps ** 0.5 * size
 
 
-def _first(model: Model, p: Params, g: Group, selected: Selected, world: World, flight: Flight, left):
+def _soonest(t: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Instant of the first impact of a group [s] (B,), infinite if there is none, and its pair (B,)."""
+    pair = jnp.argmin(jax.lax.stop_gradient(t), axis=0)
+    return jnp.take_along_axis(t, pair[None], axis=0)[0], pair
+
+
+def _search(model: Model, p: Params, g: Group, selected: Selected, world: World, flight: Flight, left) -> jax.Array:
+    """Instant of the first impact of every pair of a group [s] (P, B), infinite if there is none in ``left``."""
     n = selected.numbers
     sides = {}
     for side, index in (("a", selected.body_a), ("b", selected.body_b)):
@@ -184,9 +195,7 @@ def _first(model: Model, p: Params, g: Group, selected: Selected, world: World, 
         hit = hit & selected.filled
     if g.padding is not None:
         hit = hit & ~g.padding[:, None]
-    t = jnp.where(hit, t, jnp.inf)
-    pair = jnp.argmin(jax.lax.stop_gradient(t), axis=0)
-    return jnp.take_along_axis(t, pair[None], axis=0)[0], pair
+    return jnp.where(hit, t, jnp.inf)
 
 
 def _frame(frame, local) -> tuple[Pose, Vec3]:

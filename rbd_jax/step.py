@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from .bodies import Bodies
-from .detect import detect
+from .detect import chosen, detect, everything
 from .events import advance_to_impacts
 from .model import Model, Params, params
 from .solvers.base import Problem, Solution
@@ -210,12 +210,16 @@ def _solved(model: Model, p: Params, world: World, wrench: Wrench | None):
         return _force_step(model, p, world, wrench)
     nominal = None
     if model.method.events:
-        world, left = _to_impacts(model, p, world, wrench)
+        world, left, more = _to_impacts(model, p, world, wrench)
         p, nominal = p._with(h=left), p.h
     old = world.bodies
     contacts = detect(s, p, world, model.method.contact.reach)
     if nominal is not None:  # impulses are kept as those of a whole step
-        contacts = tuple(c._with(warm=jax.tree.map(lambda x: x * (p.h / nominal), c.warm)) for c in contacts)
+        rest = lambda c, meets: c._with(
+            warm=jax.tree.map(lambda x: x * (p.h / nominal), c.warm),
+            rows=c.rows if c.rows.e is None or c.pairs is not None else c.rows._with(meets=meets),
+        )
+        contacts = tuple(rest(c, meets) for c, meets in zip(contacts, more))
     a, tau = acceleration(p, wrench, old)
     v, L = integrator.kick(old, a, tau, p.inertia, p.h)
     problem = _problem(p, old, v, L, contacts)._with(contact=model.method.contact, nominal=nominal)
@@ -248,10 +252,13 @@ def _solved(model: Model, p: Params, world: World, wrench: Wrench | None):
     return _remember(world, bodies, p, contacts, solution, problem), problem, solution
 
 
-def _to_impacts(model: Model, p: Params, world: World, wrench: Wrench | None) -> tuple[World, jax.Array]:
-    """Every world at its last impact of this step, and what is left of the step [s], (B,)."""
+def _to_impacts(model: Model, p: Params, world: World, wrench: Wrench | None):
+    """What ``events.advance_to_impacts`` gives."""
     support = turn = zeros_like(world.bodies.v)
-    for c in detect(model.structure, p, world, model.method.contact.reach):
+    selected = []
+    contacts = detect(model.structure, p, world, model.method.contact.reach)
+    for g, gp, c in zip(model.structure.groups, p.groups, contacts):
+        selected.append(everything(g, gp) if c.pairs is None else chosen(g, gp, c.pairs))
         J = c.rows.n * c.warm.n
         if c.warm.t1 is not None:
             t1, t2 = c.rows.tangents
@@ -262,7 +269,8 @@ def _to_impacts(model: Model, p: Params, world: World, wrench: Wrench | None) ->
             turn = _spread_sides(
                 turn, c.rows, slots(c.rows.rb.cross(J)), None if c.rows.a is None else slots(c.rows.ra.cross(J))
             )
-    return advance_to_impacts(model, p, world, *acceleration(p, wrench, world.bodies), (support, turn))
+    forces = acceleration(p, wrench, world.bodies)
+    return advance_to_impacts(model, p, world, tuple(selected), *forces, (support, turn))
 
 
 def _problem(p: Params, old: Bodies, v: Vec3, L: Vec3 | None, contacts) -> Problem:

@@ -6,6 +6,8 @@ import pathlib
 import subprocess
 import sys
 
+import pytest
+
 ROOT = pathlib.Path(__file__).parents[1]
 
 
@@ -40,6 +42,47 @@ def test_physics_writes_figures(tmp_path):
     assert {"rest_speed_sphere", "roll_error", "linear_momentum"} <= set(data["figures"]["fast"])
     assert all(value is not None for _, value, _ in data["equal_step"])
     assert "## Figures" in (tmp_path / "physics.md").read_text()
+
+
+def quick(script, out, *arguments):
+    done = run(script, "--quick", "--out", out, *arguments)
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+def test_stability_writes_rows(tmp_path):
+    quick("stability.py", tmp_path)
+    rows = [json.loads(line) for line in (tmp_path / "stability.jsonl").read_text().splitlines()]
+    assert {"slide", "roll", "million"} == {r["row"] for r in rows} and {"fast"} == {r["method"] for r in rows}
+    for r in rows:
+        assert r["quick"] and r["verdict"] == "" and r["environment"]["versions"]["mujoco-core"]
+        assert r["figures"] and all(f["value"] is not None for f in r["figures"])
+    assert "slide to stop" in (tmp_path / "stability.md").read_text()
+
+
+def test_stability_maps_are_resumed_and_drawn(tmp_path):
+    pytest.importorskip("matplotlib")
+    drawn = lambda: {p.name for p in tmp_path.glob("*.png")}
+    read = lambda: json.loads((tmp_path / "stability_maps.json").read_text())
+    quick("stability_maps.py", tmp_path, "--maps", "mass_two,spin,speed")
+    maps, outcomes = read()["maps"], set(read()["outcomes"])
+    assert drawn() == {f"stability_map_{name}.png" for name in ("mass_two", "spin", "speed")}
+    for name in ("mass_two", "spin", "speed"):
+        assert set(maps[name]["methods"]) == {"penalty", "MuJoCo", "MuJoCo rigid"}
+        for entry in maps[name]["methods"].values():
+            assert len(entry["outcome"]) == len(maps[name]["y"]) and entry["commit"]
+            assert all(
+                len(row) == len(maps[name]["x"]) and set(row) <= outcomes - {"refused"} for row in entry["outcome"]
+            )
+    assert read()["environment"]["device"]
+    before = maps["mass_two"]
+    quick("stability_maps.py", tmp_path, "--maps", "height,mass,mass_two", "--methods", "MuJoCo")
+    assert read()["maps"]["mass_two"] == before and {"stability_map.png", "stability_map_height.png"} <= drawn()
+
+
+def test_unknown_map_is_refused(tmp_path):
+    done = run("stability_maps.py", "--maps", "rocket", "--out", tmp_path)
+    assert done.returncode == 2 and "unknown map 'rocket'" in done.stderr
+    assert not list(tmp_path.iterdir())
 
 
 def test_unknown_scene_is_refused(tmp_path):

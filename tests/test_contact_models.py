@@ -58,7 +58,11 @@ def test_mujocos_softness_at_the_velocity_level(solver):
     assert overlap(rbd.Method("symtop2", "mujoco", solver)) == pytest.approx(overlap("mujoco"), rel=2e-2)
 
 
-@pytest.mark.parametrize("method", ["accurate", rbd.Method(solver="newton_cone")], ids=["newton_lagged", "newton_cone"])
+@pytest.mark.parametrize(
+    "method",
+    ["accurate", rbd.Method(solver="newton_cone"), rbd.Method(solver="tgs")],
+    ids=["newton_lagged", "newton_cone", "tgs"],
+)
 def test_torsional_and_rolling_friction_slow_a_ball(method):
     """Spin about the normal falls by nu_s m g / I, rolling by nu_r g / (1.4 r)."""
     numbers = dict(friction=0.5, torsional_friction=0.02, rolling_friction=0.005)

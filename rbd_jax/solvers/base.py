@@ -92,6 +92,8 @@ class Solver:
     substeps: ClassVar[bool] = False
     #: whether it has rows of torsional and rolling friction; ``build`` refuses scenes that need them where not
     spins: ClassVar[bool] = False
+    #: whether the friction rows of a point share one elliptic cone; else sliding, torsion and rolling have one each
+    elliptic: ClassVar[bool] = False
     #: "velocity": solves for end-of-step velocities; "force": gives forces at the given state
     level: ClassVar[str] = "velocity"
 

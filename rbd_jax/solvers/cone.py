@@ -52,6 +52,7 @@ class ConeNewton(Solver):
     search: int = 8
 
     spins = True
+    elliptic = True
 
     def __post_init__(self):
         if self.iterations < 2 or self.search < 1:
@@ -84,8 +85,10 @@ class ConeNewton(Solver):
         p = tuple(_masked(c, warm) for c, warm in zip(cs, problem.warm))
         lines = _Lines(cs, problem)
 
-        def newton(carry, _):
-            p, x = materialise(carry, one)
+        def newton(p, _):
+            p = materialise(p, one)
+            # from p itself: what a step rounds away is in the next residual
+            x = materialise(_velocities(cs, free, p, problem), one)
             linear = materialise(tuple(cone(law, y) for law, y in zip(laws, x)), one)
             residual = minus(tuple(f for f, _ in linear), p)
             d = materialise(dense.newton_step(cs, tuple(g for _, g in linear), residual, problem), one)
@@ -105,12 +108,9 @@ class ConeNewton(Solver):
             t, _, _ = jax.lax.fori_loop(0, self.search, search, (zero + 1.0, zero, zero + LONGEST))
             target = tuple(minus(f, g @ dy) for (f, g), dy in zip(linear, dx))
             p = tuple(_along(q, lines.at(t, c), minus(new, q)) for c, q, new in zip(cs, p, target))
-            x = tuple(_along(y, lines.at(t, c), dy) for c, y, dy in zip(cs, x, dx))
-            return (p, x), None
+            return p, None
 
-        x = _velocities(cs, free, p, problem)
-        (p, _), _ = jax.lax.scan(newton, (p, x), length=self.iterations - 1)
-        return p
+        return jax.lax.scan(newton, p, length=self.iterations - 1)[0]
 
 
 @struct

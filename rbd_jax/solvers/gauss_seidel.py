@@ -47,6 +47,19 @@ class Group:
     mass_2: jax.Array | None
     events: Events | None
     plan: Plan | None = None
+    couples: Couples | None = None
+
+
+@struct
+class Couples:
+    """Torsional and rolling friction of every pair: coefficients [m], spin of a kinematic partner, 1/k of the rows."""
+
+    mu_spin: jax.Array
+    mass_s: jax.Array
+    surface_spin: Vec3 | None = None
+    mu_roll: jax.Array | None = None
+    mass_1: jax.Array | None = None
+    mass_2: jax.Array | None = None
 
 
 @struct
@@ -175,7 +188,17 @@ def prepare(rows: Rows, problem: Problem) -> Group:
         mass_2=mass(k(t2, False, False)) if t2 is not None else None,
         events=materialise_events(targets(rows, problem), one) if rows.e is not None else None,
         plan=chunks,
+        couples=None if rows.mu_spin is None else _couples(rows, t1, t2, ib, ia),
     )
+
+
+def _couples(rows: Rows, t1: Vec3, t2: Vec3, ib, ia) -> Couples:
+    def mass(d: Vec3):
+        k = d.dot(ib @ d)
+        return 1.0 / (k if ia is None else k + d.dot(ia @ d))
+
+    rolls = () if rows.mu_roll is None else (rows.mu_roll, mass(t1), mass(t2))
+    return Couples(rows.mu_spin, mass(rows.n), rows.surface_spin, *rolls)
 
 
 def materialise_events(events: Events, one) -> Events:
@@ -198,7 +221,10 @@ def apply(g: Group, lam: Impulses, body):
             *(add_rows(c, index, sign * inv_mass * d) for c, d in zip((v.x, v.y, v.z), (total.x, total.y, total.z)))
         )
         if w is not None and not (rows.mu is None and (rows.central_b if sign > 0 else rows.central_a)):
-            turn = inertia @ arm.cross(p).map(slots)
+            turn = arm.cross(p).map(slots)
+            if lam.s is not None:
+                turn = turn + _couple(g, lam).map(slots)
+            turn = inertia @ turn
             w = Vec3(*(add_rows(c, index, sign * d) for c, d in zip((w.x, w.y, w.z), (turn.x, turn.y, turn.z))))
         return v, w
 
@@ -206,6 +232,32 @@ def apply(g: Group, lam: Impulses, body):
     if rows.a is not None:
         v, w = side(v, w, rows.a, g.inv_mass_a, g.inertia_a, rows.ra, -1.0)
     return v, w
+
+
+def _couple(g: Group, lam: Impulses) -> Vec3:
+    """Angular impulse on B of torsional and rolling friction."""
+    c = g.rows.n * lam.s
+    return c if lam.r1 is None else c + g.t1 * lam.r1 + g.t2 * lam.r2
+
+
+def sweeps(groups, laws, lam, body, one, count: int):
+    """``count`` sweeps over all groups; with chunks, whose program is long, in a compiled loop."""
+
+    def once(carry, _):
+        body, lam = carry
+        lam = list(lam)
+        for k, g in enumerate(groups):
+            body, lam[k] = sweep(g, laws[k], lam[k], body, one)
+        return (body, tuple(lam)), None
+
+    carry = (body, tuple(lam))
+    if count > 1 and any(g.plan is not None for g in groups):
+        full = lambda l, g: jax.tree.map(lambda c: jnp.broadcast_to(c, g.rows.phi.shape), l)
+        carry = (body, tuple(full(l, g) for l, g in zip(lam, groups)))
+        return jax.lax.scan(once, carry, length=count)[0]
+    for _ in range(count):
+        carry, _ = once(carry, None)
+    return carry
 
 
 def sweep(g: Group, law: Sweep, lam: Impulses, body, one):
@@ -229,7 +281,7 @@ def sweep(g: Group, law: Sweep, lam: Impulses, body, one):
         b = Index(rows.b.rows[start:stop])
         a = Index(rows.a.rows[start:stop]) if rows.a is not None else None
         local = (take_tree(body, b), take_tree(body, a) if a is not None else None)
-        flat = (rows.n, rows.mu, g.t1, g.t2, g.inv_mass_b, g.inv_mass_a, g.inertia_b, g.inertia_a)
+        flat = (rows.n, rows.mu, g.t1, g.t2, g.inv_mass_b, g.inv_mass_a, g.inertia_b, g.inertia_a, g.couples)
         pair = _pair(rows, *cut(flat, 0), a, b)
         slots = cut((rows.rb, rows.ra, rows.surface, g.mass_1, g.mass_2, law, lam), 1)
         local, new = _slots(pair, slots, local, one, unroll=rows.slots * len(colours) <= UNROLL)
@@ -264,9 +316,8 @@ def _sweep_colours(g: Group, law: Sweep, lam: Impulses, body, one):
         a = None if table_a is None else table_a[k]
         get = lambda i: jax.tree.map(lambda c: c[i], body)
         old = (get(b), None if a is None else get(a))
-        flat = (rows.n, rows.mu, g.t1, g.t2, g.inv_mass_b, g.inv_mass_a, g.inertia_b, g.inertia_a)
-        n, mu, t1, t2, mb, ma, ib, ia = cut(flat, 0, k)
-        pair = _pair(rows, n, mu, t1, t2, mb, ma, ib, ia)
+        flat = (rows.n, rows.mu, g.t1, g.t2, g.inv_mass_b, g.inv_mass_a, g.inertia_b, g.inertia_a, g.couples)
+        pair = _pair(rows, *cut(flat, 0, k))
         slots = cut((rows.rb, rows.ra, rows.surface, g.mass_1, g.mass_2, law, lam), 1, k)
         new, part = _slots(pair, slots, old, one, unroll=False)
         add = lambda body, i, new, old: jax.tree.map(lambda c, p, q: c.at[i].add(p - q), body, new, old)
@@ -281,12 +332,26 @@ def _sweep_colours(g: Group, law: Sweep, lam: Impulses, body, one):
     return body, lam
 
 
-def _pair(rows: Rows, n, mu, t1, t2, inv_mass_b, inv_mass_a, inertia_b, inertia_a, a=None, b=None) -> Group:
+def _pair(rows: Rows, n, mu, t1, t2, inv_mass_b, inv_mass_a, inertia_b, inertia_a, couples, a=None, b=None) -> Group:
     """What ``_point`` needs of the pairs of one colour."""
     bare = rows._with(
-        n=n, mu=mu, rb=None, ra=None, phi=None, live=None, e=None, surface=None, feature=None, law=None, a=a, b=b
+        n=n,
+        mu=mu,
+        rb=None,
+        ra=None,
+        phi=None,
+        live=None,
+        e=None,
+        surface=None,
+        mu_spin=None,
+        mu_roll=None,
+        surface_spin=None,
+        feature=None,
+        law=None,
+        a=a,
+        b=b,
     )
-    return Group(bare, t1, t2, inv_mass_b, inv_mass_a, inertia_b, inertia_a, None, None, None, None, None)
+    return Group(bare, t1, t2, inv_mass_b, inv_mass_a, inertia_b, inertia_a, *(None,) * 5, couples=couples)
 
 
 def _write(body, index: Index, values):
@@ -370,13 +435,35 @@ def _point(pair: Group, at, local, one):
     vb = vb + p * pair.inv_mass_b
     if spin and not (rows.mu is None and rows.central_b):
         wb = wb + pair.inertia_b @ rb.cross(p)
-    new = (materialise((vb, wb), one), None)
     if va is not None:
         va = va - p * pair.inv_mass_a
         if spin and not (rows.mu is None and rows.central_a):
             wa = wa - pair.inertia_a @ ra.cross(p)
-        new = (new[0], materialise((va, wa), one))
-    return new, Impulses(ln, l1, l2)
+    new = Impulses(ln, l1, l2)
+    if pair.couples is not None:
+        wb, wa, new = _turned(pair, lam, materialise(new, one), wb, wa)
+    return (materialise((vb, wb), one), None if va is None else materialise((va, wa), one)), new
+
+
+def _turned(pair: Group, lam: Impulses, new: Impulses, wb: Vec3, wa: Vec3 | None):
+    """Spins after torsional friction |s| <= nu_s p_n about the normal and rolling |r| <= nu_r p_n across it."""
+    c, n = pair.couples, pair.rows.n
+    spin = wb if wa is None else wb - wa
+    if c.surface_spin is not None:
+        spin = spin - c.surface_spin
+    limit = c.mu_spin * new.n
+    new = new._with(s=jnp.clip(lam.s - c.mass_s * n.dot(spin), -limit, limit))
+    change = n * (new.s - lam.s)
+    if c.mu_roll is not None:
+        r1 = lam.r1 - c.mass_1 * pair.t1.dot(spin)
+        r2 = lam.r2 - c.mass_2 * pair.t2.dot(spin)
+        limit, size = c.mu_roll * new.n, r1 * r1 + r2 * r2
+        turns = size > limit * limit
+        shrink = jnp.where(turns, limit / jnp.sqrt(jnp.where(turns, size, 1.0)), 1.0)
+        new = new._with(r1=r1 * shrink, r2=r2 * shrink)
+        change = change + pair.t1 * (new.r1 - lam.r1) + pair.t2 * (new.r2 - lam.r2)
+    wb = wb + pair.inertia_b @ change
+    return wb, None if wa is None else wa - pair.inertia_a @ change, new
 
 
 def _sweep_chunks(g: Group, law: Sweep, lam: Impulses, body, one):
@@ -388,7 +475,7 @@ def _sweep_chunks(g: Group, law: Sweep, lam: Impulses, body, one):
     pairs, worlds, n = *p.source.shape, body[0].x.shape[0]
     column = jnp.arange(worlds)[None, :]
     filled = p.source < p.place.shape[0]
-    flat = (rows.n, rows.mu, g.t1, g.t2, g.inv_mass_b, g.inv_mass_a, g.inertia_b, g.inertia_a)
+    flat = (rows.n, rows.mu, g.t1, g.t2, g.inv_mass_b, g.inv_mass_a, g.inertia_b, g.inertia_a, g.couples)
     lam = jax.tree.map(lambda c: jnp.broadcast_to(c, rows.phi.shape), lam)
     slots = (rows.rb, rows.ra, rows.surface, g.mass_1, g.mass_2, law, lam)
 

@@ -1,8 +1,8 @@
 """Layer 5: MuJoCo's convex contact problem with the elliptic cone, solved by Newton's method.
 
-The accelerations minimise (a - a_s)' M (a - a_s) / 2 + sum_c s(J_c a - a_ref): see ``mujoco_law`` for a_ref and R, and
-``cone`` for s and the solver; D_t = D_n impratio. Everything is multiplied by the step h: velocities x = h (J a - a_ref)
-and impulses p = h f.
+The accelerations minimise (a - a_s)' M (a - a_s) / 2 + sum_c s(J_c a - a_ref): see ``mujoco_law`` for a_ref and R,
+and ``cone`` for s and the solver; D_t = D_n impratio. Everything is multiplied by the step h: velocities
+x = h (J a - a_ref) and impulses p = h f.
 
 Source: MuJoCo documentation, "Computation: solver"; compared with ``mj_forward`` of 4.0.1 (``tests/test_newton.py``).
 """

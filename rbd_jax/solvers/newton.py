@@ -81,30 +81,36 @@ class NewtonLagged(Solver):
         free = tuple(dense.relative(c, rows, problem.v, problem.w) for c, rows in zip(cs, problem.rows))
         laws = tuple(self._law(c, rows, problem, self.event_beta) for c, rows in zip(cs, problem.rows))
         p = tuple(_start(c, g) for c, g in zip(cs, problem.warm))
-        start = dense.response(problem, *dense.on_bodies(cs, p, problem))
-        u = tuple(_plus(x, dense.at_points(c, *start)) for c, x in zip(cs, free))
+        wanted = tuple(x._with(n=x.n - law.vhat) for x, law in zip(free, laws))
+
+        def velocities(p):
+            """u of every row, the normal one relative to its target, from the impulses themselves: what the linear
+            system leaves over (float32 and stiff contacts) is then part of the next residual."""
+            d = materialise(dense.response(problem, *dense.on_bodies(cs, p, problem)), one)
+            return materialise(tuple(_plus(x, dense.at_points(c, *d)) for c, x in zip(cs, wanted)), one)
+
         bound = tuple(_bound(law, warm.n, x) for law, warm, x in zip(laws, p, free))
 
         def step(carry, k):
-            p, u, bound = materialise(carry, one)
+            p, bound = materialise(carry, one)
+            u = velocities(p)
             bound = tuple(jnp.where(k == 1, jnp.maximum(q.n, 0.0), g) for q, g in zip(p, bound))
             linear = tuple(self._linearise(c, *rest) for c, *rest in zip(cs, laws, bound, p, u))
             linear = materialise(linear, one)
             residual = tuple(_minus(base, q) for (base, _), q in zip(linear, p))
             d = materialise(dense.newton_step(cs, tuple(g for _, g in linear), residual, problem), one)
             du = materialise(tuple(dense.at_points(c, *d) for c in cs), one)
-            u = tuple(_plus(x, dx) for x, dx in zip(u, du))
             p = tuple(_minus(base, g @ dx) for (base, g), dx in zip(linear, du))
-            return (p, u, bound), None
+            return (p, bound), None
 
-        (p, u, bound), _ = jax.lax.scan(step, (p, u, bound), jnp.arange(self.iterations))
+        (p, bound), _ = jax.lax.scan(step, (p, bound), jnp.arange(self.iterations))
         p = materialise(p, one)
         impulse, turn = dense.on_bodies(cs, p, problem)
         return Solution(
             impulse=impulse,
             angular_impulse=turn,
             contacts=p,
-            unconverged=self._unconverged(cs, laws, bound, p, u, free),
+            unconverged=self._unconverged(cs, laws, bound, p, velocities(p), free),
         )
 
     def _law(self, c: Contacts, rows: Rows, problem: Problem, event_beta: float) -> _Law:
@@ -128,7 +134,7 @@ class NewtonLagged(Solver):
 
     def _linearise(self, c: Contacts, law: _Law, bound, p: Impulses, u: Impulses) -> tuple[Impulses, Sym3]:
         """Base and Hessian of the linear model p' = base - G du."""
-        gap = law.vhat - u.n
+        gap = -u.n
         active = c.live & (law.w * p.n + gap - law.r * p.n > 0)
         gn = jnp.where(active, 1.0, 0.0) / law.r
         if not c.friction:
@@ -157,7 +163,7 @@ class NewtonLagged(Solver):
     def _unconverged(self, cs, laws, bounds, ps, us, frees) -> jax.Array:
         worst = scale = 0.0
         for c, law, bound, p, u, free in zip(cs, laws, bounds, ps, us, frees):
-            r = jnp.abs(law.w * p.n - jnp.maximum(law.w * p.n + law.vhat - u.n - law.r * p.n, 0.0))
+            r = jnp.abs(law.w * p.n - jnp.maximum(law.w * p.n - u.n - law.r * p.n, 0.0))
             speed = jnp.maximum(jnp.abs(free.n), jnp.abs(law.vhat))
             if c.friction:
                 limit, eps = self._friction(law, bound)

@@ -27,6 +27,7 @@ class PGS(Solver):
 
     name = "pgs"
     contact = "baumgarte"
+    spins = True
 
     def __post_init__(self):
         if self.sweeps < 1:

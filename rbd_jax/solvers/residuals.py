@@ -6,8 +6,9 @@ Residuals compare impulses p and end-of-step velocities u with the law of the co
     cone                 |p_t| <= mu p_n                                              max(|p_t| - mu p_n, 0) [N s]
     maximum dissipation  p_t minimises p_t . u_t in the cone                          |mu p_n |u_t| + p_t . u_t| [J]
 
-w is the inverse mass seen by the row, r = 0 and vhat = 0 the rigid contact. With torsional and rolling friction the last
-two are those of the whole elliptic cone, |(p_i / mu_i)| <= p_n over its friction rows.
+w is the inverse mass seen by the row; r = 0 and vhat = 0 is the rigid contact. Torsional and rolling
+friction have a cone of their own each, |p_i| <= mu_i p_n (counted as p_i mu / mu_i), and add to the power; where the solver
+is ``elliptic``, |(p_i / mu_i)| <= p_n over all friction rows of a point is the one cone.
 
 Sources: Acary, Cadoux 2013 ("Applications of an existence result for the Coulomb friction problem"), natural map and
 maximum dissipation; Le Lidec et al. 2023 ("Contact models in robotics: a comparative analysis"), one number each.
@@ -96,20 +97,22 @@ def _group(solver: Solver, c: Contacts, rows: Rows, p: Impulses, problem: Proble
     )
     if rows.mu is None:
         return out
-    # the elliptic cone in the units of sliding: an angular row i counts as p_i mu / mu_i, u_i mu_i / mu
-    scales = dict(t1=1.0, t2=1.0)
-    for name, coefficient, entries in (("s", rows.mu_spin, ("s",)), ("r", rows.mu_roll, ("r1", "r2"))):
-        if coefficient is not None:
-            safe = jnp.where(rows.mu > 0, rows.mu, 1.0)
-            scales |= {e: coefficient / safe for e in entries}
-    inverse = {e: s if isinstance(s, float) else jnp.where(s > 0, 1.0 / jnp.where(s > 0, s, 1.0), 0.0)
-               for e, s in scales.items()}  # fmt: skip
-    friction = _length([getattr(p, e) * inverse[e] for e in scales])
-    slip = _length([getattr(u, e) * scales[e] for e in scales])
-    power = sum(getattr(p, e) * getattr(u, e) for e in scales)
-    bound = rows.mu * p.n
-    out["cone"] = worst(jnp.maximum(friction - bound, 0.0))
-    out["dissipation"] = worst(jnp.abs(bound * slip + power))
+    rows_of = dict(t1=rows.mu, t2=rows.mu, s=rows.mu_spin, r1=rows.mu_roll, r2=rows.mu_roll)
+    blocks = [b for b in (("t1", "t2"), ("s",), ("r1", "r2")) if rows_of[b[0]] is not None]
+    if solver.elliptic:
+        blocks = [sum(blocks, ())]
+    cone = dissipation = 0.0
+    for block in blocks:
+        nu = {e: rows_of[e] for e in block}
+        # an angular impulse in the units of sliding: p_i mu / mu_i
+        share = {e: 1.0 if e in ("t1", "t2") else jnp.where(m > 0, rows.mu / jnp.where(m > 0, m, 1.0), 0.0)
+                 for e, m in nu.items()}  # fmt: skip
+        friction = _length([getattr(p, e) * share[e] for e in block])
+        slip = _length([getattr(u, e) * nu[e] for e in block])
+        cone = jnp.maximum(cone, friction - rows.mu * p.n)
+        dissipation = dissipation + p.n * slip + sum(getattr(p, e) * getattr(u, e) for e in block)
+    out["cone"] = worst(jnp.maximum(cone, 0.0))
+    out["dissipation"] = worst(jnp.abs(dissipation))
     return out
 
 

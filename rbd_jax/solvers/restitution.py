@@ -87,4 +87,6 @@ def targets(rows: Rows, problem: Problem) -> Events:
     )
     end = u0 + a * h
     misses = phi + 0.5 * h * (u0 + end) > 0
+    if rows.meets is not None:
+        active, misses = active & rows.meets, misses | (~rows.meets & (rows.phi > 0))
     return Events(active, vhat, jnp.where(active, left, 0.0), a, jnp.where(misses, end, jnp.inf))

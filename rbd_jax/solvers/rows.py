@@ -59,6 +59,8 @@ class Rows:
       mu_spin: coefficient of torsional friction [m], like mu; None = no row about the normal.
       mu_roll: coefficient of rolling friction [m], None = no rows about the tangents; needs mu_spin, which needs mu.
       e: restitution coefficient, None = absent.
+      meets: whether a pair collides within the step, bool (P, B), where that is known better than from the normal
+        at its start; None = unknown.
       surface: velocity of a kinematic partner at the points [m/s], (S, P, B), None = at rest.
       surface_spin: its angular velocity [rad/s], (P, B); None = at rest, or no row that needs it.
       feature: manifold code for warm starting, int32 (P, B) or (1, 1).
@@ -77,6 +79,7 @@ class Rows:
     ra: Vec3 | None = None
     mu: jax.Array | None = None
     e: jax.Array | None = None
+    meets: jax.Array | None = None
     surface: Vec3 | None = None
     mu_spin: jax.Array | None = None
     mu_roll: jax.Array | None = None

@@ -32,6 +32,7 @@ def applies(problem: Problem) -> bool:
         and rows.central_b
         and isinstance(rows.b, Index)
         and len(rows.colours) <= 1
+        and rows.mu_spin is None
         and (problem.w is None or problem.inertia.isotropic)
     )
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from ..xla import materialise
 from . import single
 from .base import Problem, Solution, Solver
-from .gauss_seidel import apply, arranged, biased, prepare, relaxing, solution, sweep
+from .gauss_seidel import apply, arranged, biased, prepare, relaxing, solution, sweeps
 from .laws import Law, contact_model
 from .restitution import normal_velocity, targets
 from .rows import Impulses, Rows
@@ -37,6 +37,7 @@ class TGS(Solver):
     name = "tgs"
     contact = "soft"
     substeps = True
+    spins = True
 
     def __post_init__(self):
         if self.sweeps < 1 or self.relax < 1:
@@ -54,16 +55,12 @@ class TGS(Solver):
             body = apply(g, l, body)
         body = materialise(body, one)
         soft = [biased(g, model.law(g.rows, g.k_n, problem)) for g in groups]
-        for _ in range(self.sweeps):
-            for k, g in enumerate(groups):
-                body, lam[k] = sweep(g, soft[k], lam[k], body, one)
+        body, lam = sweeps(groups, soft, lam, body, one, self.sweeps)
         if model.physical:
             return solution(problem, groups, body, lam)
         moving = body
         hard = [relaxing(g, l, moving, problem.h) for g, l in zip(groups, lam)]
-        for _ in range(self.relax):
-            for k, g in enumerate(groups):
-                body, lam[k] = sweep(g, hard[k], lam[k], body, one)
+        body, lam = sweeps(groups, hard, lam, body, one, self.relax)
         return solution(problem, groups, body, lam, moving)
 
     def final_law(self, rows: Rows, p: Impulses, w, problem: Problem, solution: Solution) -> Law:

@@ -3,7 +3,7 @@
 To add one: subclass ``ContactModel`` in a file of its own and list the class below.
 """
 
-from .base import ContactModel, Law
+from .base import EXIT, ContactModel, Law
 from .near_rigid import Baumgarte, NearRigid
 from .soft import Hertz, Soft
 from .solref import Solref
@@ -18,6 +18,7 @@ def contact_model(solver, problem) -> ContactModel:
 
 
 __all__ = [
+    "EXIT",
     "Baumgarte",
     "CONTACT_MODELS",
     "ContactModel",

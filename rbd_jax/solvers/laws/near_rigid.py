@@ -21,7 +21,9 @@ def near_rigid(beta: float) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class NearRigid(ContactModel):
-    """beta: near-rigid parameter [-]. push_speed: bound of the speed at which overlap is resolved [m/s]."""
+    """beta: near-rigid parameter [-]. push_speed: bound of the speed at which a contact resolves overlap [m/s];
+    bodies part at up to ``EXIT`` times this.
+    """
 
     beta: float = 0.05
     push_speed: float = 2.0

@@ -20,7 +20,7 @@ class Soft(ContactModel):
     """As stiff as the step resolves.
 
     stiffness: contact frequency times the step [-]. damping_ratio [-]. push_speed: bound of the
-    speed at which overlap is resolved [m/s].
+    speed at which a contact resolves overlap [m/s]; bodies part at up to ``EXIT`` times this.
     """
 
     stiffness: float = 0.25
