@@ -316,7 +316,7 @@ def _groups(r, kinds, category, centred, method: Method, scene: Scene, dt: float
 
 
 def _sizes(r) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Half-extents (g, 3), radius of the enclosing ball (g,) and volume (g,) of spheres and boxes; zero for the rest."""
+    """Half-extents (g, 3), radius of the enclosing ball (g,) and volume (g,) of spheres and boxes, else zero."""
     half, radius, volume = np.zeros((len(r.geom_shapes), 3)), np.zeros(len(r.geom_shapes)), np.zeros(len(r.geom_shapes))
     for k, shape in enumerate(r.geom_shapes):
         if shape.kind == "sphere":

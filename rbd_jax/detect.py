@@ -31,6 +31,7 @@ from .state import World
 from .struct import struct
 from .xla import materialise
 
+
 @struct
 class Contact:
     """A group in one step: its manifold, rows, impulses of the last step, those to start from, the keys of the

@@ -28,7 +28,7 @@ class Method:
         "spring", "mujoco") or an instance; None: the solver's own.
       solver: a name of ``rbd_jax.SOLVERS`` ("tgs", "pgs", "newton_lagged", "newton_cone", "penalty", "mujoco") or an
         instance. Any goes with any model, but "mujoco", which speaks its own only. None: the cheapest that stands:
-        "tgs", or three Newton steps of "newton_lagged" where 2 to 64 boxes may touch each other and sweeps would need
+        "tgs", or six Newton steps of "newton_lagged" where 2 to 64 boxes may touch each other and sweeps would need
         substeps for that, which is where dt > 1/240 s min(1, 8 / boxes) min(1, sqrt(size / 0.2 m)) or where
         their masses differ by more than 10 : 1.
       substeps: steps inside a step of dt; None: 1, or for "tgs" and "penalty" as many as keep a substep within
@@ -37,7 +37,8 @@ class Method:
         have there; what follows the last of them is a step of the remaining length. 0: none, an impact is
         resolved at the normal of the start of the step. An approach slower than max((1 - e) / 2, 0.02) h |a| is no
         event: the body has come to rest.
-      capacity: pairs kept per world by groups that choose theirs at run time; None: 8 a body.
+      capacity: pairs kept per world by groups that choose theirs at run time; None: 8 a moving geom, or half as many
+        again as start close.
     """
 
     integrator: str | Integrator = "symtop2"
@@ -69,7 +70,7 @@ class Method:
         if solver is None:
             sweeps = SUBSTEP * min(1.0, STACK / max(boxes, 1)) * min(1.0, math.sqrt(size / STACK_SIZE))
             direct = 2 <= boxes <= DIRECT and (dt > sweeps or ratio > RATIO)
-            solver = NewtonLagged(iterations=3) if direct and self.contact in (None, "near_rigid") else "tgs"
+            solver = NewtonLagged(iterations=6) if direct and self.contact in (None, "near_rigid") else "tgs"
         if isinstance(solver, str):
             if solver not in SOLVERS:
                 raise ValueError(f"Method: unknown solver '{solver}'; known: {', '.join(SOLVERS)}")

@@ -257,7 +257,9 @@ def test_lagged_optimality():
         live = np.asarray(rows.live)
         k = np.asarray(dense.inverse_mass(dense.contacts(rows, problem), problem))
         r = NearRigid().beta ** 2 / (4 * np.pi**2) * k * np.maximum(live.sum(0), 1)
-        vhat = np.minimum(-np.asarray(rows.phi) * 240, NearRigid().push_speed)
+        vhat = -np.asarray(rows.phi) * 240
+        slow = np.minimum(1.0, NearRigid().push_speed / np.maximum(vhat, 1e-12))  # a bound of speed, not of load
+        vhat, r = vhat * slow, r * slow
         law = np.where(live, np.maximum((vhat - u[0]) / r, 0), 0)
         np.testing.assert_allclose(p.n, law, rtol=1e-7, atol=1e-8)
         # friction opposes the slip, whatever its bound

@@ -18,7 +18,8 @@ contact fields, "Lagged"). Differs:
 * Impulses p and velocities advance together so that M (v - v*) = J' p after every step, converged or not:
   the bodies receive exactly the impulses that are reported, and two bodies exactly opposite ones.
 * g0 is the warm impulse (an estimate from the approach speed where there is none) in the first
-  Newton step and the impulse found by that step in the others: friction does not lag by a time step.
+  Newton step, the impulse found so far up to the middle of the iteration, then frozen, so that the rest converges:
+  friction does not lag by a time step.
 
 A body that touches only fixed geometry with one sphere has a closed form (exact Coulomb friction).
 
@@ -94,7 +95,8 @@ class NewtonLagged(Solver):
         def step(carry, k):
             p, bound = materialise(carry, one)
             u = velocities(p)
-            bound = tuple(jnp.where(k == 1, jnp.maximum(q.n, 0.0), g) for q, g in zip(p, bound))
+            learn = (k >= 1) & (k <= max(1, self.iterations // 2))
+            bound = tuple(jnp.where(learn, jnp.maximum(q.n, 0.0), g) for q, g in zip(p, bound))
             linear = tuple(self._linearise(c, *rest) for c, *rest in zip(cs, laws, bound, p, u))
             linear = materialise(linear, one)
             residual = tuple(_minus(base, q) for (base, _), q in zip(linear, p))

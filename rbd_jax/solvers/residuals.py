@@ -6,9 +6,9 @@ Residuals compare impulses p and end-of-step velocities u with the law of the co
     cone                 |p_t| <= mu p_n                                              max(|p_t| - mu p_n, 0) [N s]
     maximum dissipation  p_t minimises p_t . u_t in the cone                          |mu p_n |u_t| + p_t . u_t| [J]
 
-w is the inverse mass seen by the row; r = 0 and vhat = 0 is the rigid contact. Torsional and rolling
-friction have a cone of their own each, |p_i| <= mu_i p_n (counted as p_i mu / mu_i), and add to the power; where the solver
-is ``elliptic``, |(p_i / mu_i)| <= p_n over all friction rows of a point is the one cone.
+w is the inverse mass seen by the row; r = 0 and vhat = 0 is the rigid contact. Torsional and rolling friction have a
+cone of their own each, |p_i| <= mu_i p_n (counted as p_i mu / mu_i), and add to the power; where the solver is
+``elliptic``, |(p_i / mu_i)| <= p_n over all friction rows of a point is the one cone.
 
 Sources: Acary, Cadoux 2013 ("Applications of an existence result for the Coulomb friction problem"), natural map and
 maximum dissipation; Le Lidec et al. 2023 ("Contact models in robotics: a comparative analysis"), one number each.
