@@ -56,8 +56,10 @@ def advance_to_impacts(
     """Every world at its last impact of this step, the time that is left of the step [s], (B,), and the pairs of
     every group that meet in that time nevertheless (P, B): there were more impacts than events.
 
-    selected: the pairs of every group that may touch in the step. a, tau: acceleration and torque of all forces but contact; support: (impulse, angular impulse) that the
-    contacts gave in the last step.
+    Args:
+      selected: the pairs of every group that may touch in the step.
+      a, tau: acceleration [m/s^2] and torque [N m] of all forces but contact.
+      support: impulse and angular impulse that the contacts gave in the last step.
     """
     zero = zeros_like(world.bodies.v)
     a = zero if a is None else a

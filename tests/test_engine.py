@@ -353,7 +353,10 @@ def test_gradients_are_finite_and_match_differences(method):
         (lambda m, s: rbd.build(scenes.ball(), method=rbd.Method(integrator="verlet")), "unknown integrator 'verlet'"),
         (lambda m, s: rbd.build(scenes.ball(), method=rbd.Method(substeps=0)), "substeps = 0"),
         (lambda m, s: rbd.build(scenes.ball(), method=rbd.Method(integrator="rk4")), "free motion"),
-        (lambda m, s: rbd.build(scenes.ball(), method=rbd.Method(contact="soft", solver="mujoco")), "speaks contact model"),
+        (
+            lambda m, s: rbd.build(scenes.ball(), method=rbd.Method(contact="soft", solver="mujoco")),
+            "speaks contact model",
+        ),
     ],
 )
 def test_bad_input_is_refused_by_name(worlds, call, message):

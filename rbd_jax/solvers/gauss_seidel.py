@@ -241,7 +241,7 @@ def _couple(g: Group, lam: Impulses) -> Vec3:
 
 
 def sweeps(groups, laws, lam, body, one, count: int):
-    """``count`` sweeps over all groups; with chunks, whose program is long, in a compiled loop."""
+    """``count`` sweeps over all groups; many, or with chunks, whose program is long, in a compiled loop."""
 
     def once(carry, _):
         body, lam = carry
@@ -251,7 +251,7 @@ def sweeps(groups, laws, lam, body, one, count: int):
         return (body, tuple(lam)), None
 
     carry = (body, tuple(lam))
-    if count > 1 and any(g.plan is not None for g in groups):
+    if count > UNROLL or (count > 1 and any(g.plan is not None for g in groups)):
         full = lambda l, g: jax.tree.map(lambda c: jnp.broadcast_to(c, g.rows.phi.shape), l)
         carry = (body, tuple(full(l, g) for l, g in zip(lam, groups)))
         return jax.lax.scan(once, carry, length=count)[0]

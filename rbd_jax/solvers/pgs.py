@@ -11,11 +11,9 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax
-
 from ..xla import materialise
 from .base import Problem, Solution, Solver
-from .gauss_seidel import apply, arranged, biased, prepare, solution, sweep
+from .gauss_seidel import apply, arranged, biased, prepare, solution, sweeps
 from .laws import contact_model
 
 
@@ -41,16 +39,5 @@ class PGS(Solver):
         for g, l in zip(groups, warm):
             body = apply(g, l, body)
         laws = [biased(g, model.law(g.rows, g.k_n, problem)) for g in groups]
-
-        def once(carry, _):
-            body, lam = carry
-            lam = list(lam)
-            for k, g in enumerate(groups):
-                body, lam[k] = sweep(g, laws[k], lam[k], body, one)
-            return (body, tuple(lam)), None
-
-        lam = tuple(
-            jax.tree.map(lambda c, g=g: jax.numpy.broadcast_to(c, g.rows.phi.shape), l) for g, l in zip(groups, warm)
-        )
-        (body, lam), _ = jax.lax.scan(once, (materialise(body, one), lam), length=self.sweeps)
+        body, lam = sweeps(groups, laws, warm, materialise(body, one), one, self.sweeps)
         return solution(problem, groups, body, lam)
