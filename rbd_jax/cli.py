@@ -755,7 +755,7 @@ def _info(args) -> int:
         "extras": extras,
         "examples": list(examples.names()),
         "presets": {
-            name: {"integrator": _label(m.integrator), "contact": m.contact, "solver": _label(m.solver)}
+            name: {"integrator": _label(m.integrator), "contact": _label(m.contact), "solver": _label(m.solver)}
             for name, m in PRESETS.items()
         },
     }
@@ -776,7 +776,8 @@ def _info(args) -> int:
 
 
 def _label(part) -> str:
-    return part if isinstance(part, str) else part.name
+    """Name of a part of a method; one that is None is picked for the scene."""
+    return "by scene" if part is None else part if isinstance(part, str) else part.name
 
 
 def _has(find, module: str) -> bool:
