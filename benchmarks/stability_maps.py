@@ -645,7 +645,7 @@ def draw(book: Book, names, path: pathlib.Path) -> bool:
         words = book.maps[name].words | words
     patches = [Patch(color=COLOURS[o], label=words.get(o, o)) for o in OUTCOMES if o in seen]
     whole.legend(
-        handles=patches, loc="outside lower center", ncols=3 if len(names) == 1 else 6, fontsize=8, frameon=False
+        handles=patches, loc="outside lower center", ncols=2 if len(names) == 1 else 6, fontsize=8, frameon=False
     )
     whole.savefig(path)
     plt.close(whole)
