@@ -84,7 +84,7 @@ def advance_to_impacts(
         t = jnp.where(any_hit, soonest, 0.0)
         moved = _fly(model, p.inertia, flight, t)
         bodies = jax.tree.map(lambda new, old: jnp.where(any_hit, new, old), moved, bodies)
-        kinematic = _carried(kinematic, t)
+        kinematic = carried(kinematic, t)
         free_hit = any_hit
         for g, sel, (mine, where_) in zip(groups, selected, hits):
             wins = free_hit & (mine == soonest)
@@ -109,7 +109,8 @@ def _fly(model: Model, inertia: Inertia | None, f: Flight, t) -> Bodies:
     return new._with(v=b.v + f.a * t, L=None if b.L is None else b.L + f.tau * t)
 
 
-def _carried(k: Kinematic | None, t) -> Kinematic | None:
+def carried(k: Kinematic | None, t) -> Kinematic | None:
+    """Kinematic bodies after t [s] at their constant velocities."""
     return None if k is None else k._with(x=k.x + k.v * t, q=(qexp(k.w * t) @ k.q).normalised())
 
 
@@ -163,7 +164,7 @@ def _search(model: Model, p: Params, g: Group, selected: Selected, world: World,
                 poses.append(place(b.x, b.q, local))
                 velocity.append((b.x, b.v, None if b.L is None else inertia.velocity(b.q, b.L)))
             else:
-                k = _carried(frame, t)
+                k = carried(frame, t)
                 poses.append(place(k.x, k.q, local))
                 velocity.append((k.x, k.v, k.w))
         m = NARROW[g.kind].function(*poses, n.size_a, n.size_b, jnp.inf, one=p.one)

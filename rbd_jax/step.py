@@ -16,13 +16,13 @@ import jax.numpy as jnp
 
 from .bodies import Bodies
 from .detect import chosen, detect, everything
-from .events import advance_to_impacts
+from .events import advance_to_impacts, carried
 from .model import Model, Params, params
 from .solvers.base import Problem, Solution
 from .solvers.restitution import normal_velocity, targets
 from .solvers.rows import Impulses, Rows, add_rows, inverse_inertia, spread, take, take_tree
-from .spatial import Vec3, components, qexp, where, zeros_like
-from .state import Kinematic, Memory, State, World, Wrench, to_hot, to_public
+from .spatial import Vec3, components, where, zeros_like
+from .state import Memory, State, World, Wrench, to_hot, to_public
 from .status import Status
 from .struct import struct
 from .xla import materialise, opaque_one
@@ -205,7 +205,7 @@ def _solved(model: Model, p: Params, world: World, wrench: Wrench | None):
     s, integrator = model.structure, model.method.integrator
     if not s.groups:
         bodies = integrator.advance(world.bodies, free_force(p, wrench), p.inertia, p.h)
-        return world._with(bodies=bodies, kinematic=_prescribed(p, world.kinematic)), None, None
+        return world._with(bodies=bodies, kinematic=carried(world.kinematic, p.h)), None, None
     if model.method.solver.level == "force":
         return _force_step(model, p, world, wrench)
     nominal = None
@@ -312,7 +312,7 @@ def _remember(world: World, bodies: Bodies, p: Params, contacts, solution: Solut
     shape = lambda new, old: jax.tree.map(lambda a, b: jnp.broadcast_to(a, b.shape).astype(b.dtype), new, old)
     return world._with(
         bodies=bodies,
-        kinematic=_prescribed(p, world.kinematic),
+        kinematic=carried(world.kinematic, p.h),
         contacts=tuple(shape(c, w) for c, w in zip(lasting, world.contacts)),
         feature=tuple(None if w is None else shape(c.rows.feature, w) for c, w in zip(contacts, world.feature)),
         pairs=tuple(c.pairs for c in contacts),
@@ -333,13 +333,6 @@ def _marked(rows: Rows, lam: Impulses, problem: Problem) -> Impulses:
         gain = gain + jnp.sqrt(take(kick.dot(kick), rows.a))
     hit = (lam.n > 0) & (u0 < -2.0 * jax.lax.stop_gradient(gain))
     return lam._with(n=jnp.where(hit.any(axis=0), -lam.n, lam.n))
-
-
-def _prescribed(p: Params, k: Kinematic | None) -> Kinematic | None:
-    """Kinematic bodies after h at their constant velocities."""
-    if k is None:
-        return None
-    return k._with(x=k.x + k.v * p.h, q=(qexp(k.w * p.h) @ k.q).normalised())
 
 
 def _force_step(model: Model, p: Params, world: World, wrench: Wrench | None):

@@ -42,8 +42,7 @@ from .base import Problem, Solution, Solver
 from .dense import Contacts, Sym3, Sym6
 from .laws import Law, contact_model
 from .laws.base import points
-from .laws.near_rigid import near_rigid
-from .restitution import targets
+from .laws.near_rigid import convex
 from .rows import Impulses, Index, Rows, take
 
 
@@ -117,15 +116,11 @@ class NewtonLagged(Solver):
 
     def _law(self, c: Contacts, rows: Rows, problem: Problem, event_beta: float) -> _Law:
         w = dense.inverse_mass(c, problem)
+        model = convex(contact_model(self, problem).law(rows, w, problem), rows, w, problem, event_beta)
         count = points(rows, w.dtype)
-        model = contact_model(self, problem).law(rows, w, problem)
-        least = near_rigid(event_beta) * count * w
-        vhat, r = model.vhat, least if model.r is None else jnp.maximum(model.r, least)
-        if rows.e is not None:
-            events = targets(rows, problem)
-            vhat = events.target(vhat)
-            r = jnp.where(events.active, least, r)
-        law = _Law(w=w, r=r, vhat=vhat, points=count, mu=rows.mu, mu_spin=rows.mu_spin, mu_roll=rows.mu_roll)
+        law = _Law(
+            w=w, r=model.r, vhat=model.vhat, points=count, mu=rows.mu, mu_spin=rows.mu_spin, mu_roll=rows.mu_roll
+        )
         return materialise(law, problem.one)
 
     def final_law(self, rows: Rows, p: Impulses, w, problem: Problem, solution: Solution) -> Law:

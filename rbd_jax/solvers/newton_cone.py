@@ -21,9 +21,8 @@ from .cone import ConeLaw, ConeNewton, minus
 from .dense import Contacts
 from .laws import Law, contact_model
 from .laws.base import points
-from .laws.near_rigid import near_rigid
+from .laws.near_rigid import convex
 from .mujoco_law import MIN_FRICTION
-from .restitution import targets
 from .rows import Impulses, Rows
 
 
@@ -45,17 +44,12 @@ class NewtonCone(ConeNewton):
 
     def law(self, c: Contacts, rows: Rows, problem: Problem) -> ConeLaw:
         w = dense.inverse_mass(c, problem)
-        count = points(rows, w.dtype)
-        model = contact_model(self, problem).law(rows, w, problem)
-        least = near_rigid(self.event_beta) * count * w
-        vhat, r = model.vhat, least if model.r is None else jnp.maximum(model.r, least)
-        if rows.e is not None:
-            events = targets(rows, problem)
-            vhat, r = events.target(vhat), jnp.where(events.active, least, r)
+        model = convex(contact_model(self, problem).law(rows, w, problem), rows, w, problem, self.event_beta)
+        vhat, r = model.vhat, model.r
         live = jnp.where(c.live, 1.0, 0.0).astype(w.dtype)
         if not c.friction:
             return materialise(ConeLaw(live / r, Impulses(vhat)), problem.one)
-        rt = self.slip_compliance * count * w if model.rt is None else model.rt
+        rt = self.slip_compliance * points(rows, w.dtype) * w if model.rt is None else model.rt
         keep = 0.0 if model.keep is None else model.keep
         slip = jax.tree.map(lambda u: u * keep, dense.relative(c, rows, problem.v0, problem.w0))
         mu = jnp.maximum(rows.mu, MIN_FRICTION)

@@ -12,11 +12,23 @@ import math
 
 import jax.numpy as jnp
 
+from ..restitution import targets
+from ..rows import Rows
 from .base import ContactModel, Law, points, recovery
 
 
 def near_rigid(beta: float) -> float:
     return beta * beta / (4.0 * math.pi**2)
+
+
+def convex(law: Law, rows: Rows, w, problem, event_beta: float) -> Law:
+    """``law`` for a convex solver, which needs a compliance: at least that of ``event_beta``, which impacts have."""
+    least = near_rigid(event_beta) * points(rows, w.dtype) * w
+    vhat, r = law.vhat, least if law.r is None else jnp.maximum(law.r, least)
+    if rows.e is not None:
+        events = targets(rows, problem)
+        vhat, r = events.target(vhat), jnp.where(events.active, least, r)
+    return law._with(vhat=vhat, r=r)
 
 
 @dataclasses.dataclass(frozen=True)
