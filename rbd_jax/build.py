@@ -12,7 +12,7 @@ import numpy as np
 
 from .contact import NARROW
 from .contact.broadphase import SLOP, bits, key_of, no_key
-from .method import Method, find
+from .method import SMOOTHING, Method, find
 from .model import Choice, Group, Model, Structure
 from .scene import Scene, resolve, rotation
 from .shapes import SHAPES
@@ -139,6 +139,7 @@ def build(scene: Scene, dt: float | None = None, method: str | Method = "accurat
         com=None if _near(r.com, 0).all() else jnp.asarray(r.com, dtype),
         principal=None if frames.principal is None else jnp.asarray(frames.principal, dtype),
         laws=_mujoco_laws(r, groups, scene, dtype) if mujoco and groups else None,
+        smoothing=jnp.asarray(SMOOTHING, dtype) if method.solver.smoothing else None,
     )
     return model, _start(model, r, dtype)
 

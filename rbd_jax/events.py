@@ -7,9 +7,11 @@ of the impact. This repeats ``Method.events`` times; what is left of the step is
 
 The instant solves phi(t) = 0 by ITERATIONS of t <- t + root of phi + u dt + a dt^2 / 2, which is exact at once for a
 sphere and a plane and converges quadratically elsewhere; phi(t) is convex for spheres and for the straight path
-of a sphere to a box, so no thin wall is jumped over.
+of a sphere to a box, so no thin wall is jumped over. The search is not differentiated: the instant of the pair that
+collides has the derivative dt = -(dphi/dtheta) dtheta / (dphi/dt), as phi(t(theta), theta) = 0.
 
-An approach slower than max((1 - e) / 2, REST) h |a| (a: what the forces but contact give both bodies) is left to the
+Groups whose pairs mention no restitution have no events: their impacts are resolved within the step. (Zero is a value:
+restitution=0.0 has them.) An approach slower than max((1 - e) / 2, REST) h |a| (a: what the forces but contact give both bodies) is left to the
 step: the bodies have come to rest. One pair at a time: of simultaneous impacts the order is that of the groups.
 Gradients: exact, of the event map; where the number or the order of the impacts changes, the motion is
 discontinuous and has none.
@@ -20,6 +22,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from . import implicit
 from .bodies import Bodies, Inertia
 from .contact import NARROW, Pose
 from .detect import Selected, manifold, min_size, pick, place, rows_of, side_of
@@ -57,7 +60,7 @@ def advance_to_impacts(
     every group that meet in that time nevertheless (P, B): there were more impacts than events.
 
     Args:
-      selected: the pairs of every group that may touch in the step.
+      selected: the pairs of every group that may touch in the step, None for a group that has no events.
       a, tau: acceleration [m/s^2] and torque [N m] of all forces but contact.
       support: impulse and angular impulse that the contacts gave in the last step.
     """
@@ -68,7 +71,9 @@ def advance_to_impacts(
     a = a + push * (p.inv_mass / p.h)
     if world.bodies.L is not None:
         tau = (zeros_like(a) if tau is None else tau) + turn * (1.0 / p.h)
-    groups = model.structure.groups
+    taking_part = [(g, sel) for g, sel in zip(model.structure.groups, selected) if sel is not None]
+    groups = [g for g, _ in taking_part]
+    pairs = tuple(sel for _, sel in taking_part)
     step = jnp.broadcast_to(p.h, world.step.shape).astype(zero.x.dtype)
     last = jnp.finfo(zero.x.dtype).eps ** 0.5 * step
 
@@ -76,29 +81,67 @@ def advance_to_impacts(
         bodies, kinematic, left = carry
         world_now = world._with(bodies=bodies, kinematic=kinematic)
         flight = Flight(bodies, a, tau, free)
-        hits = [_soonest(_search(model, p, g, sel, world_now, flight, left - last)) for g, sel in zip(groups, selected)]
+        found = jax.lax.stop_gradient((p, pairs, world_now, flight, left - last))
+        hits = [_soonest(_search(model, found[0], g, sel, *found[2:])) for g, sel in zip(groups, found[1])]
         soonest = hits[0][0]
         for t, _ in hits[1:]:
             soonest = jnp.minimum(soonest, t)
         any_hit = jnp.isfinite(soonest)
         t = jnp.where(any_hit, soonest, 0.0)
+        free_hit, colliding = any_hit, []
+        for g, sel, (mine, where_) in zip(groups, pairs, hits):
+            wins = free_hit & (mine == soonest)
+            free_hit = free_hit & ~wins
+            pair = pick(sel, where_[None])
+            t = jnp.where(wins, _instant(model, g)(t, (p, pair, world_now, flight)), t)
+            colliding.append((g, pair, wins))
         moved = _fly(model, p.inertia, flight, t)
         bodies = jax.tree.map(lambda new, old: jnp.where(any_hit, new, old), moved, bodies)
         kinematic = carried(kinematic, t)
-        free_hit = any_hit
-        for g, sel, (mine, where_) in zip(groups, selected, hits):
-            wins = free_hit & (mine == soonest)
-            free_hit = free_hit & ~wins
+        for g, pair, wins in colliding:
             world_now = world._with(bodies=bodies, kinematic=kinematic)
-            bodies = _collide(p, g, pick(sel, where_[None]), world_now, flight, wins)
+            bodies = _collide(p, g, pair, world_now, flight, wins)
         return (bodies, kinematic, left - t), None
 
     carry = (world.bodies, world.kinematic, step)
     (bodies, kinematic, left), _ = jax.lax.scan(event, carry, length=model.method.events)
     world = world._with(bodies=bodies, kinematic=kinematic)
     flight = Flight(bodies, a, tau, free)
-    more = tuple(jnp.isfinite(_search(model, p, g, sel, world, flight, left)) for g, sel in zip(groups, selected))
-    return world, left, more
+    found = jax.lax.stop_gradient((p, selected, world, flight, left))
+    meets = lambda g, sel: None if sel is None else jnp.isfinite(_search(model, found[0], g, sel, *found[2:]))
+    return world, left, tuple(meets(g, sel) for g, sel in zip(model.structure.groups, found[1]))
+
+
+def _instant(model: Model, g: Group):
+    """(t, (params, pair, world, flight)) -> t (B,), as the instant at which the first of the pair's points touches.
+
+    Zero derivative where the pair overlaps: what touched before the start of the step cannot have touched earlier.
+    """
+
+    def gap(t, args):
+        p, pair, world, flight = args
+        phi, u, _, live = _gaps(model, p, g, pair, world, flight)(t[None])
+        first = jnp.argmin(jax.lax.stop_gradient(jnp.where(live, phi, jnp.inf)), axis=0)
+        return tuple(jnp.take_along_axis(jnp.broadcast_to(c, phi.shape), first[None], axis=0)[0, 0] for c in (phi, u))
+
+    def shift(phi, change, rate, args):
+        closes = (phi > -_tolerance(g, args[1])[0]) & (rate < 0)
+        return jnp.where(closes, -change, 0.0) / jnp.where(closes, rate, 1.0)
+
+    @jax.custom_jvp
+    def instant(t, args):  # see ``implicit``: its own derivative is right to first order
+        phi, u = gap(t, args)
+        d = shift(jax.lax.stop_gradient(phi), phi, jax.lax.stop_gradient(u), args)
+        return t + (d - jax.lax.stop_gradient(d))
+
+    def rule(primals, tangents):
+        t, args = instant(*primals), primals[1]
+        change = implicit.tangent(lambda args: gap(t, args)[0], args, tangents[1])
+        phi, rate = jax.jvp(lambda t: gap(t, args)[0], (t,), (jnp.ones_like(t),))
+        return t, shift(phi, change, rate, args)
+
+    instant.defjvp(rule, symbolic_zeros=True)
+    return instant
 
 
 def _fly(model: Model, inertia: Inertia | None, f: Flight, t) -> Bodies:
@@ -133,13 +176,12 @@ def _tolerance(g: Group, selected: Selected) -> jax.Array:
 
 def _soonest(t: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Instant of the first impact of a group [s] (B,), infinite if there is none, and its pair (B,)."""
-    pair = jnp.argmin(jax.lax.stop_gradient(t), axis=0)
+    pair = jnp.argmin(t, axis=0)
     return jnp.take_along_axis(t, pair[None], axis=0)[0], pair
 
 
-def _search(model: Model, p: Params, g: Group, selected: Selected, world: World, flight: Flight, left) -> jax.Array:
-    """Instant of the first impact of every pair of a group [s] (P, B), infinite if there is none in ``left``."""
-    n = selected.numbers
+def _moving(model: Model, p: Params, g: Group, selected: Selected, world: World, flight: Flight) -> dict:
+    """side -> (flight or kinematic motion, inertia) of the geoms that move."""
     sides = {}
     for side, index in (("a", selected.body_a), ("b", selected.body_b)):
         category = side_of(g, side)
@@ -148,9 +190,15 @@ def _search(model: Model, p: Params, g: Group, selected: Selected, world: World,
             sides[side] = (take_tree(flight, index), inertia)
         elif category == "kinematic":
             sides[side] = (take_tree(world.kinematic, index), None)
+    return sides
+
+
+def _gaps(model: Model, p: Params, g: Group, selected: Selected, world: World, flight: Flight):
+    """t -> gap, closing speed and normal acceleration of every slot, (S, P, B), and which hold a point."""
+    n = selected.numbers
+    sides = _moving(model, p, g, selected, world, flight)
 
     def at(t):
-        """Gap, closing speed and normal acceleration of every slot, (S, P, B)."""
         poses, velocity, accel = [], [], []
         for side, local in (("a", n.local_a), ("b", n.local_b)):
             if side not in sides:
@@ -177,6 +225,14 @@ def _search(model: Model, p: Params, g: Group, selected: Selected, world: World,
         a = sum(sign * m.normal.dot(acc) for acc, sign in accel)
         return m.distance, u, jnp.broadcast_to(a, m.distance.shape), m.live
 
+    return at
+
+
+def _search(model: Model, p: Params, g: Group, selected: Selected, world: World, flight: Flight, left) -> jax.Array:
+    """Instant of the first impact of every pair of a group [s] (P, B), infinite if there is none in ``left``."""
+    n = selected.numbers
+    sides = _moving(model, p, g, selected, world, flight)
+    at = _gaps(model, p, g, selected, world, flight)
     start = jnp.zeros(jnp.broadcast_shapes(_shape(selected, g), left.shape), left.dtype)
     first = NARROW[g.kind].first
     if first is not None and len(sides) == 2:

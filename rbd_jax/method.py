@@ -33,7 +33,7 @@ class Method:
         their masses differ by more than 10 : 1.
       substeps: steps inside a step of dt; None: 1, or for "tgs" and "penalty" as many as keep a substep within
         1/240 s at the dt of ``build``.
-      events: impacts a world may have in a (sub)step at their own instant, with the position and normal they
+      events: with pairs that mention restitution, impacts a world may have in a (sub)step at their own instant, with the position and normal they
         have there; what follows the last of them is a step of the remaining length. 0: none, an impact is
         resolved at the normal of the start of the step. An approach slower than max((1 - e) / 2, 0.02) h |a| is no
         event: the body has come to rest.
@@ -47,6 +47,11 @@ class Method:
     substeps: int | None = None
     capacity: int | None = None
     events: int = 0
+
+    @property
+    def reach(self) -> str:
+        """Which contact slots are alive, see ``detect.detect``: smoothed contact acts from a distance."""
+        return "all" if self.solver.smoothing else self.contact.reach
 
     def resolve(
         self, dt: float, scene_integrator: str | None = None, boxes: int = 0, size: float = 1.0, ratio: float = 1.0
@@ -106,13 +111,16 @@ class Method:
         return Method(integrator, contact, solver, substeps, self.capacity, self.events)
 
 
+#: ``Model.smoothing`` of a solver that smooths, until it is replaced: normal and slip speed [m/s].
+SMOOTHING = (0.05, 0.05)
+
 #: Substeps are a compiled loop, but a step that needs more than this is a wrong dt.
 MAX_SUBSTEPS = 1000
 
 PRESETS = {
     "fast": Method("symtop2", None, None),
     "accurate": Method("symtop4", "near_rigid", NewtonLagged(iterations=8)),
-    "gradient": Method("symtop2", "near_rigid", NewtonLagged(iterations=8)),
+    "gradient": Method("symtop2", "near_rigid", NewtonLagged(iterations=6, polish=3), events=2),
     "mujoco": Method("scene", "mujoco", "mujoco"),
 }
 

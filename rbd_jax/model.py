@@ -134,6 +134,7 @@ BASE_NDIM = dict(
     dt=0,
     gravity=1,
     drag=1,
+    smoothing=1,
     mass=1,
     friction=1,
     restitution=1,
@@ -161,6 +162,7 @@ class Model:
 
     Attributes (n bodies, g geoms in the order of ``names.geoms``):
       dt: [s]. gravity: (3,) [m/s^2]. drag: (2,) linear and angular rate [1/s].
+      smoothing: (2,) normal and slip speed [m/s] of a solver that smooths contact; (0, 0) is contact as it is.
       mass: (n,) [kg]. inertia: (n,) when all bodies are isotropic, else (n, 3) principal moments in
         the order of the body's axes [kg m^2].
       friction, restitution: (g,) [-]. pair_friction, pair_restitution: (overridden pairs,).
@@ -196,6 +198,7 @@ class Model:
     com: jax.Array | None = None
     principal: jax.Array | None = None
     laws: object = None
+    smoothing: jax.Array | None = None
 
     @property
     def names(self):
@@ -253,6 +256,7 @@ def _check_number(name: str, value: np.ndarray) -> None:
         "radius": (value > 0, "> 0 [m]"),
         "half_extents": (value > 0, "> 0 [m]"),
         **{f: (value >= 0, ">= 0") for f in CONDIMS},
+        "smoothing": (value >= 0, ">= 0 [m/s]"),
         "restitution": ((value >= 0) & (value <= 1), "in 0..1"),
         **{"pair_" + f: (value >= 0, ">= 0") for f in CONDIMS},
         "pair_restitution": ((value >= 0) & (value <= 1), "in 0..1"),
@@ -309,6 +313,7 @@ class Params:
     drag: tuple | None = None
     com: Vec3 | None = None
     principal: Quat | None = None
+    smoothing: tuple | None = None
 
 
 def leaf(model: Model, name: str, batch: tuple[int, ...]) -> jax.Array | None:
@@ -371,7 +376,7 @@ def params(model: Model, batch: tuple[int, ...], one: jax.Array) -> Params:
             moments = Vec3(*_reordered((moments[:, 0], moments[:, 1], moments[:, 2]), s.axes))
         inertia = Inertia(moments)
     gravity = get("gravity")
-    drag = get("drag")
+    drag, smoothing = get("drag"), get("smoothing")
     return Params(
         h=h,
         mass=mass,
@@ -383,6 +388,7 @@ def params(model: Model, batch: tuple[int, ...], one: jax.Array) -> Params:
         drag=None if drag is None else (drag[0], drag[1]),
         com=None if model.com is None else _vec3(get("com")),
         principal=_principal(model, get),
+        smoothing=None if smoothing is None else (smoothing[0], smoothing[1]),
     )
 
 

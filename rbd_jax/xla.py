@@ -29,3 +29,9 @@ def materialise(tree, one: jax.Array | float | None = 1.0):
     if one is None:
         return tree
     return jax.tree.map(lambda x: x / jax.lax.stop_gradient(one + 0.0 * x), tree)
+
+
+def materialise_linear(tree, like: jax.Array, one):
+    """``materialise`` in a way that JAX sees is linear: the divisors are made of ``like``, an array of the leaves' shape."""
+    unit = jax.lax.stop_gradient(one + 0.0 * like)
+    return jax.tree.map(lambda x: x / unit, tree)

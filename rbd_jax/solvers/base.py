@@ -27,6 +27,7 @@ class Problem:
       h: step [s], scalar or (B,). nominal: the step over which overlap is resolved, where h is what impacts left
         of it; None = h.
       warm: impulses to start from, one entry a group, already zero where a contact is new.
+      smoothing: (normal, slip) speeds [m/s] over which a solver that smooths does so, each (1,) or (B,).
       contact: the ``laws.ContactModel``, None = the solver's own.
       one: an array equal to 1 that XLA cannot see through, see ``rbd_jax.xla.materialise``.
     """
@@ -44,6 +45,7 @@ class Problem:
     q: Quat | None = None
     inertia: Inertia | None = None
     inv_inertia: InverseInertia | None = None
+    smoothing: tuple | None = None
     contact: object = static(default=None)
 
 
@@ -96,6 +98,8 @@ class Solver:
     elliptic: ClassVar[bool] = False
     #: "velocity": solves for end-of-step velocities; "force": gives forces at the given state
     level: ClassVar[str] = "velocity"
+    #: None, or what of contact is smoothed ("forward": all of it, "backward": its derivatives)
+    smoothing = None
 
     def solve(self, problem: Problem) -> Solution:
         raise NotImplementedError

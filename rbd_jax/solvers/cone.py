@@ -15,8 +15,7 @@ Differs: fixed iteration counts; the last iteration is a full Newton step. Where
 has its own step length.
 
 Cost: ``iterations`` linear systems as in ``newton``, and ``iterations x search`` evaluations of the law.
-Gradients: one-step differentiation through the last Newton step (Bolte, Pauwels, Vaiter 2023): exact first
-derivatives at convergence, forward and reverse; second derivatives are wrong.
+Gradients: implicit, of the converged problem: exact where a world is not ``unconverged``; all orders, forward and reverse.
 """
 
 from __future__ import annotations
@@ -26,6 +25,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
+from .. import implicit
 from ..spatial import Vec3
 from ..struct import struct
 from ..xla import materialise
@@ -71,24 +71,28 @@ class ConeNewton(Solver):
         cs = tuple(dense.contacts(rows, problem) for rows in problem.rows)
         laws = tuple(self.law(c, rows, problem) for c, rows in zip(cs, problem.rows))
         free = tuple(self.free(c, rows, law, problem) for c, rows, law in zip(cs, problem.rows, laws))
-        p = self._search_minimum(*jax.lax.stop_gradient((cs, laws, free, problem)))
-        p = materialise(p, problem.one)
-        # one Newton step whose value and derivative both count
-        x = _velocities(cs, free, p, problem)
-        p, x = _newton(cs, laws, p, x, problem)
-        impulse, turn = dense.on_bodies(cs, p, problem)
-        return Solution(impulse=impulse, angular_impulse=turn, contacts=p, unconverged=_unconverged(cs, laws, p, x))
+        system = _System(cs, laws, free, problem._with(rows=(), warm=()))
+        start = tuple(_masked(c, warm) for c, warm in zip(cs, problem.warm))
 
-    def _search_minimum(self, cs, laws, free, problem: Problem):
+        solution = implicit.root(
+            lambda args: self._search_minimum(*args),
+            lambda p, args: _residual(args[0], p),
+            lambda p, args, r: _correction(args[0], p, r),
+        )
+        p = materialise(solution((system, start)), problem.one)
+        impulse, turn = dense.on_bodies(cs, p, problem)
+        return Solution(impulse=impulse, angular_impulse=turn, contacts=p, unconverged=_unconverged(system, p))
+
+    def _search_minimum(self, system: _System, start):
         """Newton's method with an exact line search; returns the impulses."""
+        cs, laws, problem = system.cs, system.laws, system.problem
         one = problem.one
-        p = tuple(_masked(c, warm) for c, warm in zip(cs, problem.warm))
         lines = _Lines(cs, problem)
 
         def newton(p, _):
             p = materialise(p, one)
             # from p itself: what a step rounds away is in the next residual
-            x = materialise(_velocities(cs, free, p, problem), one)
+            x = materialise(system.velocities(p), one)
             linear = materialise(tuple(cone(law, y) for law, y in zip(laws, x)), one)
             residual = minus(tuple(f for f, _ in linear), p)
             d = materialise(dense.newton_step(cs, tuple(g for _, g in linear), residual, problem), one)
@@ -110,7 +114,7 @@ class ConeNewton(Solver):
             p = tuple(_along(q, lines.at(t, c), minus(new, q)) for c, q, new in zip(cs, p, target))
             return p, None
 
-        return jax.lax.scan(newton, p, length=self.iterations - 1)[0]
+        return jax.lax.scan(newton, start, length=self.iterations - 1)[0]
 
 
 @struct
@@ -129,23 +133,34 @@ class ConeLaw:
     mu_roll: jax.Array | None = None
 
 
-def _velocities(cs, free, p, problem: Problem):
-    """x of every row when the impulses p act."""
-    d = dense.response(problem, *dense.on_bodies(cs, p, problem))
-    return tuple(jax.tree.map(jnp.add, y, dense.at_points(c, *d)) for c, y in zip(cs, free))
+@struct
+class _System:
+    """Everything the rows of a problem depend on besides the impulses; ``problem`` is without its rows."""
+
+    cs: tuple[Contacts, ...]
+    laws: tuple[ConeLaw, ...]
+    free: tuple[Impulses, ...]
+    problem: Problem
+
+    def velocities(self, p) -> tuple[Impulses, ...]:
+        """x of every row when the impulses p act."""
+        d = dense.response(self.problem, *dense.on_bodies(self.cs, p, self.problem))
+        return tuple(_plus(y, dense.at_points(c, *d)) for c, y in zip(self.cs, self.free))
 
 
-def _newton(cs, laws, p, x, problem: Problem):
-    """A full Newton step. Only the law is differentiated: the derivatives of the linear system are
-    multiplied by the step itself, which is zero at convergence."""
-    one = problem.one
-    linear = materialise(tuple(cone(law, y) for law, y in zip(laws, x)), one)
-    residual = minus(tuple(f for f, _ in linear), p)
-    cs, gs, problem = jax.lax.stop_gradient((cs, tuple(g for _, g in linear), problem))
-    d = materialise(dense.newton_step(cs, gs, residual, problem), one)
-    dx = materialise(tuple(dense.at_points(c, *d) for c in cs), one)
-    p = tuple(minus(f, g @ dy) for (f, _), g, dy in zip(linear, gs, dx))
-    return p, jax.tree.map(jnp.add, x, dx)
+def _residual(system: _System, p):
+    """Impulses of the law minus p, zero at the solution."""
+    x = materialise(system.velocities(p), system.problem.one)
+    return tuple(minus(cone(law, y)[0], q) for law, y, q in zip(system.laws, x, p))
+
+
+def _correction(system: _System, p, residual):
+    """The Newton step from p, linear in the residual."""
+    cs, one = system.cs, system.problem.one
+    x = materialise(system.velocities(p), one)
+    gs = materialise(tuple(cone(law, y)[1] for law, y in zip(system.laws, x)), one)
+    d = dense.newton_step(cs, gs, residual, system.problem)
+    return tuple(minus(r, g @ dense.at_points(c, *d)) for c, g, r in zip(cs, gs, residual))
 
 
 def cone(law: ConeLaw, x: Impulses) -> tuple[Impulses, Sym3 | Sym6]:
@@ -269,9 +284,13 @@ def minus(a, b):
     return jax.tree.map(lambda x, y: x - y, a, b)
 
 
-def _unconverged(cs, laws, ps, xs) -> jax.Array:
+def _plus(a, b):
+    return jax.tree.map(lambda x, y: x + y, a, b)
+
+
+def _unconverged(system: _System, ps) -> jax.Array:
     worst = largest = 0.0
-    for c, law, p, x in zip(cs, laws, ps, xs):
+    for c, law, p, x in zip(system.cs, system.laws, ps, system.velocities(ps)):
         force, _ = cone(law, x)
         for q, f in zip(jax.tree.leaves(p), jax.tree.leaves(force)):
             worst = jnp.maximum(worst, jnp.where(c.live, jnp.abs(q - f), 0.0).max(axis=(0, 1)))

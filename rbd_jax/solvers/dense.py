@@ -72,6 +72,26 @@ class Sym6:
 
 
 @struct
+class Lagging:
+    """G of rows whose friction follows their normal impulse: ``symmetric``, and in the column of the normal velocity the
+    entries ``column`` of the friction rows (its n is not used). Its Newton systems are not symmetric.
+    """
+
+    symmetric: Sym3 | Sym6
+    column: Impulses
+
+    def __matmul__(self, u: Impulses) -> Impulses:
+        p, k = self.symmetric @ u, self.column
+        return p._with(
+            **{name: getattr(p, name) + getattr(k, name) * u.n for name in FRICTION if getattr(k, name) is not None}
+        )
+
+
+#: Friction rows of ``Impulses``.
+FRICTION = ("t1", "t2", "s", "r1", "r2")
+
+
+@struct
 class Contacts:
     """A group of rows in the contact frames of its pairs.
 
@@ -246,7 +266,7 @@ def world_inertia(problem: Problem) -> list:
 
 
 def newton_step(cs, gs, residuals, problem: Problem) -> tuple[Vec3, Vec3 | None]:
-    """d = (M + J' G J)^-1 J' residual, as velocity changes of every body."""
+    """d = (M + J' G J)^-1 J' residual, as velocity changes of every body; linear in the residuals."""
     rhs = on_bodies(cs, residuals, problem)
     if is_coupled(cs):
         return _coupled(cs, gs, rhs, problem)
@@ -257,32 +277,21 @@ def _uncoupled(cs, gs, rhs, problem: Problem):
     """One 3x3 or 6x6 system a body."""
     one = problem.one
     zero = jnp.zeros_like(rhs[0].x)
-    mass = zero + 1.0 / problem.inv_mass
     spin = any(c.rb is not None for c in cs)
-    h = [[None] * (i + 1) for i in range(6 if spin else 3)]
-    for i in range(3):
-        h[i][i] = mass
-    if spin:
-        for i, row in enumerate(world_inertia(problem)):
-            for j, x in enumerate(row):
-                h[3 + i][3 + j] = None if x is None else zero + x
-
-    def put(i, j, c, x):
-        if x is not None:
-            h[i][j] = add_rows(zero if h[i][j] is None else h[i][j], c.b, x)
-
+    size = 6 if spin else 3
+    own = _own_block(problem, zero + 1.0 / problem.inv_mass, spin)
+    h = [[None if x is None else zero + x for x in row] for row in own]
     for c, g in zip(cs, gs):
-        k, cb, wb = _diagonal_blocks(c, g, c.rb, one)
-        for i in range(3):
-            for j in range(3):
-                if j <= i:
-                    put(i, j, c, k[i][j])
-                    if wb is not None:
-                        put(3 + i, 3 + j, c, wb[i][j])
-                if cb is not None:
-                    put(3 + i, j, c, cb[i][j])
+        ((_, _, block), *_) = _pair_blocks(c, g, one, size)
+        for i in range(size):
+            for j in range(size):
+                if block[i][j] is not None:
+                    h[i][j] = add_rows(zero if h[i][j] is None else h[i][j], c.b, block[i][j])
     b = components(rhs[0]) + (components(rhs[1]) if spin else ())
-    x = _small_solve(tuple(tuple(r) for r in h), b, one)
+    if any(isinstance(g, Lagging) for g in gs):
+        x = _small_general_solve(tuple(tuple(r) for r in h), b, one)
+    else:
+        x = _small_solve(tuple(tuple(r[: i + 1]) for i, r in enumerate(h)), b, one)
     if spin:
         return Vec3(*x[:3]), Vec3(*x[3:])
     return Vec3(*x), rhs[1]  # no row turns a body: its zero torque is its zero spin
@@ -295,15 +304,7 @@ def _coupled(cs, gs, rhs, problem: Problem):
     spin = any(c.rb is not None for c in cs)
     size = 6 if spin else 3
     zero = jnp.zeros((n, worlds), rhs[0].x.dtype)
-    mass = zero + 1.0 / problem.inv_mass
-    own = [[None] * size for _ in range(size)]
-    for i in range(3):
-        own[i][i] = mass
-    if spin:
-        inertia = world_inertia(problem)
-        for i in range(3):
-            for j in range(i + 1):
-                own[3 + i][3 + j] = own[3 + j][3 + i] = inertia[i][j]
+    own = _own_block(problem, zero + 1.0 / problem.inv_mass, spin)
     body = np.arange(n, dtype=np.int32)
     h = jnp.zeros((n, n, size, size, worlds), zero.dtype)
     h = h.at[body, body].add(_stack(own, n, worlds, zero.dtype), unique_indices=True)
@@ -323,15 +324,34 @@ def _coupled(cs, gs, rhs, problem: Problem):
                 h = h.at[world, p, q].add(jnp.transpose(x, (0, 3, 1, 2)))
     h = jnp.transpose(h, (0, 1, 3, 2, 4)).reshape(worlds, n * size, n * size)
     b = jnp.stack(components(rhs[0]) + (components(rhs[1]) if spin else ()), axis=1)  # (n, size, B)
-    x = _dense_solve(h, jnp.transpose(b, (2, 0, 1)).reshape(worlds, n * size))
+    solve = _dense_general_solve if any(isinstance(g, Lagging) for g in gs) else _dense_solve
+    x = solve(h, jnp.transpose(b, (2, 0, 1)).reshape(worlds, n * size))
     x = jnp.transpose(x.reshape(worlds, n, size), (2, 1, 0))
     if spin:
         return Vec3(*x[:3]), Vec3(*x[3:])
     return Vec3(*x), rhs[1]
 
 
-def _pair_blocks(c: Contacts, g: Sym3 | Sym6, one, size: int):
+def _own_block(problem: Problem, mass, spin: bool) -> list:
+    """Rows of M of every body, entries (n, B or 1); None = structural zero."""
+    own = [[None] * (6 if spin else 3) for _ in range(6 if spin else 3)]
+    for i in range(3):
+        own[i][i] = mass
+    if spin:
+        inertia = world_inertia(problem)
+        for i in range(3):
+            for j in range(i + 1):
+                own[3 + i][3 + j] = own[3 + j][3 + i] = inertia[i][j]
+    return own
+
+
+def _pair_blocks(c: Contacts, g: Sym3 | Sym6 | Lagging, one, size: int):
     """(body row, body column, size x size entries) of every block of J' G J of one group."""
+    if isinstance(g, Lagging):
+        blocks = zip(_pair_blocks(c, g.symmetric, one, size), _column_blocks(c, g.column, one, size))
+        for (i, j, block), more in blocks:
+            yield i, j, [[_add(x, y) for x, y in zip(*rows)] for rows in zip(block, more)]
+        return
     k, cb, wb = _diagonal_blocks(c, g, c.rb, one)
     yield c.b, c.b, _assemble(k, cb, wb, size)
     if c.a is None:
@@ -344,6 +364,28 @@ def _pair_blocks(c: Contacts, g: Sym3 | Sym6, one, size: int):
     ab = _assemble(neg(k), neg(ca), neg(wab), size, upper=neg(cb))
     yield c.a, c.b, ab
     yield c.b, c.a, [list(row) for row in zip(*ab)]
+
+
+def _column_blocks(c: Contacts, k: Impulses, one, size: int):
+    """The blocks of ``_pair_blocks``, in its order, of friction impulses k u_n."""
+    sides = [(c.rb, c.rb, 1.0)]
+    if c.a is not None:
+        sides += [(c.ra, c.ra, 1.0), (c.ra, c.rb, -1.0), (c.rb, c.ra, -1.0)]
+    x, y = k.t1, k.t2
+    for left, right, sign in sides:
+        force = [[None, None, (sign * x).sum(0)], [None, None, (sign * y).sum(0)], [None] * 3]
+        if left is None:
+            yield _assemble(_rotate(c, materialise(force, one), one), None, None, size)
+            continue
+        f = (sign * x, sign * y)
+        t = (-left.z * f[1], left.z * f[0], left.x * f[1] - left.y * f[0])
+        t = tuple(_add(a, None if b is None else sign * b) for a, b in zip(t, (k.r1, k.r2, k.s)))
+        arm = (right.y, -right.x)  # r x n
+        upper = [[*((v * a).sum(0) for a in arm), None] for v in f] + [[None] * 3]
+        lower = [[None, None, v.sum(0)] for v in t]
+        spin = [[*((v * a).sum(0) for a in arm), None] for v in t]
+        turned = [_rotate(c, materialise(m, one), one) for m in (force, lower, spin, upper)]
+        yield _assemble(*turned[:3], size, [list(r) for r in zip(*turned[3])])
 
 
 def _assemble(k, c, w, size: int, upper=None):
@@ -471,6 +513,19 @@ def _dense_solve_jvp(primals, tangents):
     return x, _substitute(factor, db - jnp.einsum("bij,bj->bi", dh, x))
 
 
+@jax.custom_jvp
+def _dense_general_solve(h, b):
+    """h^-1 b for any h (B, N, N), b (B, N)."""
+    return jnp.linalg.solve(h, b[..., None])[..., 0]
+
+
+@_dense_general_solve.defjvp
+def _dense_general_solve_jvp(primals, tangents):
+    (h, b), (dh, db) = primals, tangents
+    x = _dense_general_solve(h, b)
+    return x, _dense_general_solve(h, db - jnp.einsum("bij,bj->bi", dh, x))
+
+
 def _substitute(factor, b):
     solve = jax.lax.linalg.triangular_solve
     y = solve(factor, b[..., None], left_side=True, lower=True)
@@ -522,3 +577,35 @@ def _small_substitute(factor, b, one):
     for i in reversed(range(n)):
         x[i] = keep(_sub(y[i] / d[i], _add(*(_mul(low[k][i], x[k]) for k in range(i + 1, n)))))
     return tuple(x)
+
+
+@jax.custom_jvp
+def _small_general_solve(h, b, one):
+    """x = h^-1 b component by component: h any matrix (its leading minors are not singular) as nested tuples."""
+    n = len(b)
+    h = [list(row) for row in h]
+    for k in range(n):
+        for i in range(k + 1, n):
+            if h[i][k] is None:
+                continue
+            h[i][k] = materialise(h[i][k] / h[k][k], one)  # L below the diagonal, U on and above it
+            for j in range(k + 1, n):
+                less = _mul(h[i][k], h[k][j])
+                h[i][j] = h[i][j] if less is None else materialise(_sub(h[i][j], less), one)
+    unit = None if one is None else jax.lax.stop_gradient(one + 0.0 * h[0][0])
+    keep = lambda x: x if unit is None else x / unit
+    y = []
+    for i in range(n):
+        y.append(keep(_sub(b[i], _add(*(_mul(h[i][k], y[k]) for k in range(i))))))
+    x = [None] * n
+    for i in reversed(range(n)):
+        x[i] = keep(_sub(y[i], _add(*(_mul(h[i][k], x[k]) for k in range(i + 1, n)))) / h[i][i])
+    return tuple(x)
+
+
+@_small_general_solve.defjvp
+def _small_general_solve_jvp(primals, tangents):
+    (h, b, one), (dh, db, _) = primals, tangents
+    x = _small_general_solve(h, b, one)
+    r = tuple(_sub(db[i], _add(*map(_mul, dh[i], x))) for i in range(len(b)))
+    return x, _small_general_solve(h, r, one)

@@ -21,10 +21,23 @@ contact fields, "Lagged"). Differs:
   Newton step, the impulse found so far up to the middle of the iteration, then frozen, so that the rest converges:
   friction does not lag by a time step.
 
+* ``polish`` further steps have the bound g0 = p_n as an unknown (a system that is not symmetric) and converge
+  quadratically to Coulomb's law as it is regularised above. Where they do not (beyond the Painleve condition) the
+  iterate before them stays.
+
 A body that touches only fixed geometry with one sphere has a closed form (exact Coulomb friction).
 
+Smoothing, for derivatives across contact and before it: the normal law becomes the central path
+
+    p_n (u_n - vhat + R p_n) = delta^2 / w
+
+with delta [m/s] a traced number, so that a contact acts from a distance, and eps^2 grows by the square of another. Both
+may be zero, which is the law above. "backward" keeps the values of the law above and smooths the derivatives only.
+Source: Howell et al. 2022 (Dojo), "Gradients" (the central path of an interior-point method).
+
 Cost: ``iterations`` 6x6 systems a body, or dense 6n x 6n systems where bodies touch each other (up to about 16).
-Gradients: exact, of the iteration as it runs, forward and reverse.
+Gradients: with ``polish`` = 0 exact, of the iteration as it runs. Else implicit, of the converged problem: one more
+system, no stored iterates, exact where a world is not ``unconverged``; all orders, forward and reverse.
 """
 
 from __future__ import annotations
@@ -35,11 +48,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .. import implicit
 from ..struct import struct
-from ..xla import materialise
+from ..xla import materialise, materialise_linear
 from . import dense
 from .base import Problem, Solution, Solver
-from .dense import Contacts, Sym3, Sym6
+from .dense import Contacts, Lagging, Sym3, Sym6
 from .laws import Law, contact_model
 from .laws.base import points
 from .laws.near_rigid import convex
@@ -55,6 +69,9 @@ class NewtonLagged(Solver):
       event_beta: near-rigid parameter (see ``laws.near_rigid``) of impacts and of rows that are rigid in the model [-].
       slip_speed: friction is regularised below this speed v_s [m/s]; a held body creeps at a fraction of it.
       slip_compliance: sigma [-], bounds the stiffness of friction to 1/(sigma w).
+      polish: final Newton steps that solve for the bound of friction too, >= 1 makes the derivatives implicit.
+      smoothing: None, "forward" (values and derivatives) or "backward" (derivatives only), with the numbers of
+        ``Problem.smoothing``.
       tolerance: a world is ``unconverged`` where the residual of a row, as a velocity, exceeds this
         fraction of the fastest relative velocity (before or wanted) plus slip_speed.
     """
@@ -64,6 +81,8 @@ class NewtonLagged(Solver):
     slip_speed: float = 1e-4
     slip_compliance: float = 1e-3
     tolerance: float = 5e-2
+    polish: int = 0
+    smoothing: str | None = None
 
     name = "newton_lagged"
     contact = "near_rigid"
@@ -72,47 +91,116 @@ class NewtonLagged(Solver):
     def __post_init__(self):
         if self.iterations < 2:
             raise ValueError(f"NewtonLagged.iterations = {self.iterations}: needs at least 2")
+        if self.polish < 0:
+            raise ValueError(f"NewtonLagged.polish = {self.polish}: must be >= 0")
+        if self.smoothing not in (None, "forward", "backward"):
+            raise ValueError(f"NewtonLagged.smoothing = {self.smoothing!r}: must be None, 'forward' or 'backward'")
+        if self.smoothing and not self.polish:
+            raise ValueError("NewtonLagged.smoothing needs polish >= 1: its derivatives are implicit")
 
     def solve(self, problem: Problem) -> Solution:
-        if _single_sphere(problem):
+        closed = _single_sphere(problem)
+        if closed and not self.smoothing:
             return self._closed_form(problem)
-        one = problem.one
+        system, start = self._system(problem)
+        if self.smoothing == "backward":
+            soft, system = system, system._with(smooth=None)
+            p, bound = (self._closed_form(problem).contacts, None) if closed else self._found(system, start)
+            p = _with_derivative(lambda args: self._found(*args)[0])(p, (soft, start))
+        else:
+            p, bound = self._found(system, start)
+        p = materialise(p, problem.one)
+        impulse, turn = dense.on_bodies(system.cs, p, problem)
+        return Solution(
+            impulse=impulse,
+            angular_impulse=turn,
+            contacts=p,
+            unconverged=None if bound is None else self._unconverged(system, bound, p),
+            warm=not closed,
+        )
+
+    def _system(self, problem: Problem):
+        """What the rows depend on, and the impulses and bounds of friction to start from."""
         cs = tuple(dense.contacts(rows, problem) for rows in problem.rows)
         free = tuple(dense.relative(c, rows, problem.v, problem.w) for c, rows in zip(cs, problem.rows))
         laws = tuple(self._law(c, rows, problem, self.event_beta) for c, rows in zip(cs, problem.rows))
         p = tuple(_start(c, g) for c, g in zip(cs, problem.warm))
-        wanted = tuple(x._with(n=x.n - law.vhat) for x, law in zip(free, laws))
-
-        def velocities(p):
-            """u of every row, the normal one relative to its target, from the impulses themselves: what the linear
-            system leaves over (float32 and stiff contacts) is then part of the next residual."""
-            d = materialise(dense.response(problem, *dense.on_bodies(cs, p, problem)), one)
-            return materialise(tuple(_plus(x, dense.at_points(c, *d)) for c, x in zip(cs, wanted)), one)
-
         bound = tuple(_bound(law, warm.n, x) for law, warm, x in zip(laws, p, free))
+        smooth = None
+        if self.smoothing:
+            if problem.smoothing is None:
+                raise ValueError("NewtonLagged.smoothing needs the numbers Problem.smoothing")
+            smooth = problem.smoothing
+        return _System(cs, laws, free, problem._with(rows=(), warm=()), smooth), (p, bound)
+
+    def _found(self, system: _System, start):
+        """Impulses, and the bound of their friction."""
+        if not self.polish:
+            return self._iterate(system, start)
+
+        def better(new, old, args):
+            worst = lambda p: self._violation(args[0], _bound_of(p), p)[0]
+            return worst(new) <= worst(old)
+
+        solution = implicit.root(
+            lambda args: self._iterate(*args)[0],
+            lambda p, args: self._residual(args[0], p),
+            lambda p, args, r: self._correction(args[0], p, r),
+            self.polish,
+            better,
+        )
+        p = solution((system, start))
+        return p, _bound_of(p)
+
+    def _iterate(self, system: _System, start):
+        """The lagged iteration."""
+        cs, problem = system.cs, system.problem
+        one = problem.one
 
         def step(carry, k):
             p, bound = materialise(carry, one)
-            u = velocities(p)
             learn = (k >= 1) & (k <= max(1, self.iterations // 2))
-            bound = tuple(jnp.where(learn, jnp.maximum(q.n, 0.0), g) for q, g in zip(p, bound))
-            linear = tuple(self._linearise(c, *rest) for c, *rest in zip(cs, laws, bound, p, u))
-            linear = materialise(linear, one)
+            if self.polish:
+                learn = k >= 1
+            bound = tuple(jnp.where(learn, q, g) for q, g in zip(_bound_of(p), bound))
+            linear = materialise(self._linearised(system, bound, p), one)
             residual = tuple(_minus(base, q) for (base, _), q in zip(linear, p))
             d = materialise(dense.newton_step(cs, tuple(g for _, g in linear), residual, problem), one)
             du = materialise(tuple(dense.at_points(c, *d) for c in cs), one)
             p = tuple(_minus(base, g @ dx) for (base, g), dx in zip(linear, du))
             return (p, bound), None
 
-        (p, bound), _ = jax.lax.scan(step, (p, bound), jnp.arange(self.iterations))
-        p = materialise(p, one)
-        impulse, turn = dense.on_bodies(cs, p, problem)
-        return Solution(
-            impulse=impulse,
-            angular_impulse=turn,
-            contacts=p,
-            unconverged=self._unconverged(cs, laws, bound, p, velocities(p), free),
-        )
+        return jax.lax.scan(step, start, jnp.arange(self.iterations))[0]
+
+    def _residual(self, system: _System, p):
+        """Impulses of the law minus p, zero at the solution; friction is bounded by p itself."""
+        p = materialise(p, system.problem.one)
+        linear = self._linearised(system, _bound_of(p), p)
+        return tuple(_minus(base, q) for (base, _), q in zip(linear, p))
+
+    def _correction(self, system: _System, p, residual):
+        """The Newton step from p, linear in the residual, with the bound of friction as an unknown."""
+        cs, problem, bound = system.cs, system.problem, _bound_of(p)
+        u = materialise(system.velocities(p), problem.one)
+        keep = lambda tree: tuple(materialise_linear(x, q.n, problem.one) for x, q in zip(tree, p))
+        residual = keep(residual)
+        ones = tuple(jnp.ones_like(b) for b in bound)
+        gs, rs = [], []
+        _, more = jax.jvp(lambda bound: tuple(b for b, _ in self._linearised(system, bound, p, u)), (bound,), (ones,))
+        linear = self._linearised(system, bound, p, u)
+        for c, law, (_, g), q, x, e, r in zip(cs, system.laws, linear, p, u, more, residual):
+            if c.friction:
+                acts = c.live if system.smooth is not None else _acts(c, law, q, x)
+                e = jax.tree.map(lambda y: jnp.where(acts, y, 0.0), e)
+                normal = g.force.zz if isinstance(g, Sym6) else g.zz
+                g = Lagging(g, jax.tree.map(lambda y: y * normal, e))
+                r = jax.tree.map(lambda y, z: y + z * r.n, r, e._with(n=jnp.zeros_like(r.n)))
+            gs.append(g)
+            rs.append(r)
+        gs, rs = materialise(tuple(gs), problem.one), keep(rs)
+        d = dense.newton_step(cs, gs, rs, problem)
+        d = materialise_linear(d, problem.v.x + 0.0 * p[0].n.sum((0, 1)), problem.one)
+        return tuple(_minus(r, g @ dense.at_points(c, *d)) for c, g, r in zip(cs, gs, rs))
 
     def _law(self, c: Contacts, rows: Rows, problem: Problem, event_beta: float) -> _Law:
         w = dense.inverse_mass(c, problem)
@@ -129,17 +217,26 @@ class NewtonLagged(Solver):
         )
         return Law(law.vhat, law.r)
 
-    def _linearise(self, c: Contacts, law: _Law, bound, p: Impulses, u: Impulses) -> tuple[Impulses, Sym3]:
-        """Base and Hessian of the linear model p' = base - G du."""
-        gap = -u.n
-        active = c.live & (law.w * p.n + gap - law.r * p.n > 0)
-        gn = jnp.where(active, 1.0, 0.0) / law.r
+    def _linearised(self, system: _System, bound, p, u=None) -> tuple[tuple[Impulses, Sym3 | Sym6], ...]:
+        """Base and Hessian of the linear model p' = base - G du of every group; base is the impulse of the law."""
+        if u is None:
+            u = materialise(system.velocities(p), system.problem.one)
+        return tuple(
+            self._linearise(c, law, system.smooth, *rest) for c, law, *rest in zip(system.cs, system.laws, bound, p, u)
+        )
+
+    def _linearise(self, c: Contacts, law: _Law, smooth, bound, p: Impulses, u: Impulses):
+        if smooth is None:
+            gn = jnp.where(_acts(c, law, p, u), 1.0, 0.0) / law.r
+            normal = -gn * u.n
+        else:
+            normal, gn = _central_path(c, law, smooth[0], p.n, u.n)
         if not c.friction:
-            return Impulses(gn * gap), Sym3(gn)
+            return Impulses(normal), Sym3(gn)
         bound = jnp.where(c.live, bound, 0.0)
-        limit, eps = self._friction(law, bound)
+        limit, eps = self._friction(law, smooth, bound)
         base, (xx, yy, xy) = _drag(limit, _inverse_speed(u.t1, u.t2, eps), (p.t1, p.t2), (u.t1, u.t2))
-        base, g = Impulses(gn * gap, *base), Sym3(gn, xx=xx, yy=yy, xy=xy)
+        base, g = Impulses(normal, *base), Sym3(gn, xx=xx, yy=yy, xy=xy)
         if not c.torsion:
             return base, g
         # couples: the same law for the velocity nu w / mu, so that a coefficient nu [m] of zero is no special case
@@ -152,25 +249,36 @@ class NewtonLagged(Solver):
         (r1, r2), (xx, yy, xy) = _drag(nu * bound, inverse, (p.r1, p.r2), (u.r1, u.r2))
         return base._with(s=s, r1=r1, r2=r2), Sym6(g, dense.UNCOUPLED, Sym3(zz, xx=xx, yy=yy, xy=xy))
 
-    def _friction(self, law: _Law, bound):
+    def _friction(self, law: _Law, smooth, bound):
         """mu g0 and eps."""
         limit = law.mu * bound
-        return limit, jnp.maximum(self.slip_compliance * law.w * limit, self.slip_speed)
+        eps = jnp.maximum(self.slip_compliance * law.w * limit, self.slip_speed)
+        return limit, eps if smooth is None else jnp.sqrt(eps * eps + smooth[1] * smooth[1])
 
-    def _unconverged(self, cs, laws, bounds, ps, us, frees) -> jax.Array:
+    def _unconverged(self, system: _System, bound, p) -> jax.Array:
+        worst, scale = self._violation(system, bound, p)
+        return worst > self.tolerance * scale + self.slip_speed
+
+    def _violation(self, system: _System, bounds, ps):
+        """Largest residual of a row of a world, as a velocity [m/s] (B,), and the fastest relative velocity."""
         worst = scale = 0.0
-        for c, law, bound, p, u, free in zip(cs, laws, bounds, ps, us, frees):
-            r = jnp.abs(law.w * p.n - jnp.maximum(law.w * p.n - u.n - law.r * p.n, 0.0))
+        us = system.velocities(ps)
+        for c, law, bound, p, u, free in zip(system.cs, system.laws, bounds, ps, us, system.free):
+            z = law.w * p.n - u.n - law.r * p.n
+            if system.smooth is None:
+                r = jnp.abs(law.w * p.n - jnp.maximum(z, 0.0))
+            else:
+                r = jnp.abs(law.w * p.n - 0.5 * (z + jnp.sqrt(z * z + 4.0 * system.smooth[0] ** 2)))
             speed = jnp.maximum(jnp.abs(free.n), jnp.abs(law.vhat))
             if c.friction:
-                limit, eps = self._friction(law, bound)
+                limit, eps = self._friction(law, system.smooth, bound)
                 drag = limit * _inverse_speed(u.t1, u.t2, eps)
                 e1, e2 = p.t1 + drag * u.t1, p.t2 + drag * u.t2
                 r = jnp.maximum(r, law.w * jnp.maximum(jnp.abs(e1), jnp.abs(e2)))
                 speed = jnp.maximum(speed, jnp.maximum(jnp.abs(free.t1), jnp.abs(free.t2)))
             worst = jnp.maximum(worst, jnp.where(c.live, r, 0.0).max(axis=(0, 1)))
             scale = jnp.maximum(scale, jnp.where(c.live, speed, 0.0).max(axis=(0, 1)))
-        return worst > self.tolerance * scale + self.slip_speed
+        return worst, scale
 
     def _closed_form(self, problem: Problem) -> Solution:
         """One sphere contact a body: the normal row alone gives p_n, then Coulomb friction stops or slows the slip."""
@@ -196,6 +304,27 @@ class NewtonLagged(Solver):
 
 
 @struct
+class _System:
+    """Everything the rows of a problem depend on besides the impulses.
+
+    free: relative velocities without contact. problem: without its rows. smooth: (delta, slip) [m/s] or None.
+    """
+
+    cs: tuple[Contacts, ...]
+    laws: tuple
+    free: tuple[Impulses, ...]
+    problem: Problem
+    smooth: tuple | None = None
+
+    def velocities(self, p) -> tuple[Impulses, ...]:
+        """u of every row, the normal one relative to its target, from the impulses themselves: what a linear
+        system leaves over (float32 and stiff contacts) is then part of the next residual."""
+        d = materialise(dense.response(self.problem, *dense.on_bodies(self.cs, p, self.problem)), self.problem.one)
+        wanted = (x._with(n=x.n - law.vhat) for x, law in zip(self.free, self.laws))
+        return tuple(_plus(x, dense.at_points(c, *d)) for c, x in zip(self.cs, wanted))
+
+
+@struct
 class _Law:
     """w inverse mass, r compliance, vhat target of every normal row (S, P, B); points: live points of a pair."""
 
@@ -206,6 +335,39 @@ class _Law:
     mu: jax.Array | None
     mu_spin: jax.Array | None = None
     mu_roll: jax.Array | None = None
+
+
+def _acts(c: Contacts, law: _Law, p: Impulses, u: Impulses) -> jax.Array:
+    """The active set of the primal-dual step."""
+    return c.live & (law.w * p.n - u.n - law.r * p.n > 0)
+
+
+def _central_path(c: Contacts, law: _Law, delta, p, u) -> tuple[jax.Array, jax.Array]:
+    """Base and slope of the rows w p = (z + sqrt(z^2 + 4 delta^2)) / 2, z = w p - u - r p, linearised in p and u."""
+    z = law.w * p - u - law.r * p
+    square = z * z + 4.0 * delta * delta
+    some = square > 0
+    root = jnp.where(some, jnp.sqrt(jnp.where(some, square, 1.0)), 0.0)
+    part = 0.5 * (1.0 + jnp.where(some, z / jnp.where(some, root, 1.0), 0.0))
+    stiff = (1.0 - part) * law.w + part * law.r
+    base = p - (law.w * p - 0.5 * (z + root)) / stiff
+    return jnp.where(c.live, base, 0.0), jnp.where(c.live, part / stiff, 0.0)
+
+
+def _with_derivative(f):
+    """(p, args) -> p with the derivative of ``f(args)``, which it may differ from."""
+
+    @jax.custom_jvp
+    def value(p, args):
+        return p
+
+    value.defjvp(lambda primals, tangents: (primals[0], implicit.tangent(f, primals[1], tangents[1])), symbolic_zeros=True)
+    return value
+
+
+def _bound_of(p):
+    """Normal impulses that bound friction."""
+    return tuple(jnp.maximum(q.n, 0.0) for q in p)
 
 
 def _inverse_speed(a, b, eps) -> jax.Array:

@@ -1,0 +1,72 @@
+"""Layer 1: derivatives of the solution of an equation that do not go through the iteration that found it.
+
+With F(p, theta) = 0 the solution p(theta) has the derivative dp = -(dF/dp)^-1 (dF/dtheta) dtheta. The rule below is itself
+made of differentiable operations, evaluated at p(theta), so that its derivative is right too: F(p(theta), theta)
+vanishes identically, hence so does what the neglected part of the rule would add. (A custom reverse rule would forbid
+forward mode, and a one-step form alone, whose second derivatives are wrong, is no substitute.)
+
+Where JAX splits a loop for reverse mode it takes the functions in what is known without their rules. So the last
+step of the iteration is one whose own derivative is right to first order (the one-step form), which makes
+second derivatives right there as well.
+
+Source: implicit function theorem; Blondel et al. 2022, "Efficient and modular implicit differentiation"; Bolte, Pauwels,
+Vaiter 2023, "One-step differentiation of iterative algorithms".
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
+
+
+def root(solve, residual, correction, steps: int = 1, better=None):
+    """A function theta -> p with ``residual(p, theta) = 0`` and its implicit derivative, forward and reverse.
+
+    Args:
+      solve: theta -> p to within ``steps`` Newton steps, any program; it is not differentiated.
+      residual: (p, theta) -> r, a tree like p.
+      correction: (p, theta, r) -> dp, linear in r: solves (d residual / d p) dp = -r. The last steps are such.
+      better: (new, old, theta) -> whether to take those steps, or None: always.
+      All may close over static values only.
+    """
+
+    @jax.custom_jvp
+    def solution(theta):
+        fixed = jax.lax.stop_gradient(theta)
+        old = jax.lax.stop_gradient(solve(fixed))
+
+        def step(p, _):
+            p = jax.lax.stop_gradient(p)
+            return jax.tree.map(lambda p, d: p + d, p, correction(p, fixed, residual(p, theta))), None
+
+        new = step(old, None)[0] if steps == 1 else jax.lax.scan(step, old, length=steps)[0]
+        if better is None:
+            return new
+        take = better(*jax.lax.stop_gradient((new, old)), fixed)
+        return jax.tree.map(lambda p, q: jnp.where(take, p, q), new, old)
+
+    def rule(primals, tangents):
+        (theta,), (change,) = primals, tangents
+        p = solution(theta)
+        r = tangent(lambda theta: residual(p, theta), theta, change)
+        return p, correction(p, theta, r)
+
+    solution.defjvp(rule, symbolic_zeros=True)
+    return solution
+
+
+def tangent(f, theta, change):
+    """d f(theta) along ``change``, whose leaves may be symbolic zeros (they cost nothing)."""
+    leaves, tree = jax.tree.flatten(theta)
+    changes = jax.tree.leaves(change, is_leaf=lambda c: isinstance(c, SymbolicZero))
+    moving = [i for i, c in enumerate(changes) if not isinstance(c, SymbolicZero)]
+
+    def of_moving(values):
+        merged = list(leaves)
+        for i, value in zip(moving, values):
+            merged[i] = value
+        return f(jax.tree.unflatten(tree, merged))
+
+    _, out = jax.jvp(of_moving, ([leaves[i] for i in moving],), ([changes[i] for i in moving],))
+    return out
