@@ -11,6 +11,7 @@ from .build import build
 from .contact.sdf import sdf
 from .convert import from_mujoco, to_mujoco
 from .diagnostics import Contacts, SimulationError, check, contacts, energy, inertia_world, momentum, wrench_at
+from .horizon import GradientNorms, gradient_norms
 from .method import PRESETS, Method
 from .mjcf import load_mjcf, to_mjcf
 from .model import Model
@@ -30,6 +31,7 @@ __all__ = [
     "Box",
     "Contacts",
     "Geom",
+    "GradientNorms",
     "Method",
     "Model",
     "PRESETS",
@@ -49,6 +51,7 @@ __all__ = [
     "contacts",
     "energy",
     "from_mujoco",
+    "gradient_norms",
     "inertia_world",
     "load_mjcf",
     "momentum",

@@ -2,8 +2,9 @@
 
 Both convert to the hot layout at their edges. Under ``jax.vmap`` they do not run their loops with a
 batch axis in front: a batching rule hands the whole batch to the direct call, so that
-``vmap(rollout)`` is the same program as ``rollout`` of a batched state. Under differentiation the
-plain program is used.
+``vmap(rollout)`` is the same program as ``rollout`` of a batched state. Under differentiation
+another program is used (``_derived``): its loop comes in the blocks of ``checkpoint``, and worlds that
+are lost from the start are replaced by harmless ones. Its values are those of the direct program.
 """
 
 from __future__ import annotations
@@ -17,7 +18,21 @@ import numpy as np
 from .model import BASE_NDIM, Model, batch_of
 from .spatial import Vec3
 from .state import State, World, Wrench
-from .step import advance, enter, leave, with_memory
+from .step import (
+    advance,
+    enter,
+    grown,
+    harmless,
+    held,
+    leave,
+    marked,
+    moving,
+    opened,
+    restored,
+    substeps,
+    unfit,
+    with_memory,
+)
 
 
 def step(model: Model, state: State, control=None) -> State:
@@ -42,7 +57,15 @@ def step(model: Model, state: State, control=None) -> State:
     return _step(model, with_memory(model, state), control)
 
 
-def rollout(model: Model, state: State, steps: int, every: int = 1, control=None) -> tuple[State, State]:
+def rollout(
+    model: Model,
+    state: State,
+    steps: int,
+    every: int = 1,
+    control=None,
+    checkpoint: int | tuple[int, ...] | None = None,
+    truncate: int | None = None,
+) -> tuple[State, State]:
     """Advance the worlds by ``steps`` steps in one compiled loop.
 
     Args:
@@ -50,27 +73,66 @@ def rollout(model: Model, state: State, steps: int, every: int = 1, control=None
       steps: number of steps, >= 0.
       every: steps between two samples of the trajectory, >= 1.
       control: as for :func:`step`; a function is called at every step.
+      checkpoint: memory of reverse mode. None: what every step needs to be differentiated is kept. K: the state at
+        the start of every block of K steps is kept, and a block is computed again when it is differentiated; this
+        needs steps / K states and K steps' intermediate values, so take K = sqrt(steps) or less. (K1, K2, ...),
+        decreasing: blocks of K1 steps in blocks of K2 and so on, each level computing its steps once more;
+        K1 = steps^(2/3), K2 = steps^(1/3) for very long rollouts. A block ends at a sample: K is rounded down to a
+        multiple of ``every``, or the steps between two samples are divided. What is left over is a block of its
+        own, and compiles the step once more. Values, forward mode and forward cost are those of None.
+      truncate: None, or after how many steps the derivative is cut (truncated back-propagation through time): step
+        k K takes its state as a constant for k = 1, 2, ... Values are unchanged; the final state depends on
+        the model and the control of the last block only, on the initial state only where steps <= K, and a sample on
+        what happened since the last cut before it.
 
     Returns:
       final: state after all steps.
       traj: a State of ``steps // every + 1`` samples, the first the initial state; leaves
         (batch..., samples, n), without memory.
 
+    A world that is not finite, or whose state exceeds 7e12 (float32; 6e102 in float64) in norm, is frozen at its last
+    state in range, from the start if it was so given, with the status NOT_FINITE. Its derivative is that of this
+    state: the identity with respect to the state at which it froze, zero with respect to model and control
+    since. Derivatives of other worlds and of numbers that all worlds share are not affected (up to second derivatives
+    in forward over reverse mode); only a ``control`` function whose own derivative is not finite at the state of a
+    frozen world gives NaN for what it closes over.
+
     Raises:
-      ValueError: steps < 0, every < 1, wrong shapes or batch sizes.
+      ValueError: steps < 0, every < 1, checkpoint or truncate not as above, wrong shapes or batch sizes.
     """
-    for name, value, least in (("steps", steps, 0), ("every", every, 1)):
-        if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < least:
+    for name, value, least in (("steps", steps, 0), ("every", every, 1), ("truncate", truncate, 1)):
+        if not (name == "truncate" and value is None) and not _whole(value, least):
             raise ValueError(f"rollout: {name} = {value!r} must be an integer >= {least}")
+    blocks = blocks_of("rollout", checkpoint)
+    truncate = None if truncate is None else int(truncate)
     _check_state(model, state)
     state = with_memory(model, state)
     if callable(control):
-        return _rollout_with(model, state, int(steps), int(every), control)
+        return _rollout_with(model, state, int(steps), int(every), control, blocks, truncate)
     _check_wrench(model, state, control)
-    return _rollout(model, state, control, int(steps), int(every))
+    return _rollout(model, state, control, int(steps), int(every), blocks, truncate)
 
 
 # --- checks, before anything is traced ---
+
+
+def _whole(value, least: int) -> bool:
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= least
+
+
+def blocks_of(name: str, checkpoint) -> tuple[int, ...]:
+    """Sizes of the blocks of ``checkpoint``, outer first; () for None.
+
+    Raises:
+      ValueError: neither None nor an integer >= 1 nor decreasing ones, in the name of function ``name``.
+    """
+    sizes = () if checkpoint is None else checkpoint if isinstance(checkpoint, tuple) else (checkpoint,)
+    falls = all(_whole(size, 1) for size in sizes) and all(a > b for a, b in zip(sizes, sizes[1:]))
+    if not falls or checkpoint == ():
+        raise ValueError(
+            f"{name}: checkpoint = {checkpoint!r} must be None, an integer >= 1 or a tuple of decreasing ones, outer first"
+        )
+    return tuple(int(size) for size in sizes)
 
 
 def _check_state(model: Model, state: State) -> None:
@@ -118,11 +180,28 @@ def _hot_wrench(wrench: Wrench | None, batch, dtype) -> Wrench | None:
     return Wrench(convert(wrench.force), convert(wrench.torque))
 
 
-def _step_batch(model: Model, state: State, wrench: Wrench | None) -> State:
+def _step_batch(model: Model, state: State, wrench: Wrench | None, safe: bool = False) -> State:
     batch = batch_of(model, state.batch_shape)
-    p, world = enter(model, state, batch)
-    world = advance(model, p, world, _hot_wrench(wrench, batch, state.x.x.dtype))
-    return leave(model, p, world, batch)
+
+    def run(model, state):
+        p, world = enter(model, state, batch)
+        world = advance(model, p, world, _hot_wrench(wrench, batch, state.x.x.dtype))
+        return leave(model, p, world, batch)
+
+    return _from_start(run, model, state, batch, safe)
+
+
+def _from_start(run, model: Model, state: State, batch, safe: bool):
+    """``run(model, state)``, a tree of States, with the worlds that cannot be stepped frozen from the start.
+
+    safe: for differentiation: such worlds are replaced before they enter, and handed back as they were.
+    """
+    state = grown(state, batch)
+    lost = unfit(model, state)
+    if not safe:
+        return run(model, marked(state, lost))
+    out = run(*harmless(model, state, lost))
+    return jax.tree.map(lambda s: restored(s, state, lost), out, is_leaf=lambda s: isinstance(s, State))
 
 
 def _sample(model: Model, p, world: World) -> State:
@@ -130,34 +209,90 @@ def _sample(model: Model, p, world: World) -> State:
     return leave(model, p, world, None, memory=False)
 
 
-def _rollout_batch(model: Model, state: State, wrench, steps: int, every: int, control=None) -> tuple[State, State]:
+def _rollout_batch(
+    model: Model,
+    state: State,
+    wrench,
+    steps: int,
+    every: int,
+    ask=None,
+    blocks: tuple[int, ...] = (),
+    truncate: int | None = None,
+    safe: bool = False,
+    nudge=None,
+) -> tuple[State, State]:
+    """Final state and trajectory.
+
+    Args:
+      wrench: of all steps, or with ``ask`` what ``ask(model, state, *wrench) -> Wrench`` takes.
+      blocks, truncate: as in ``rollout``.
+      safe: see ``_from_start``.
+      nudge: (function (p, world, d) -> world, tree of d with an axis of samples in front): what happens to the world
+        of each sample.
+    """
     batch = batch_of(model, state.batch_shape)
+    run = lambda model, state: _loop(model, state, batch, wrench, steps, every, ask, blocks, truncate, nudge)
+    return _from_start(run, model, state, batch, safe)
+
+
+def _loop(model, state, batch, wrench, steps, every, ask, blocks, truncate, nudge):
     p, world = enter(model, state, batch)
-    hot = _hot_wrench(wrench, batch, state.x.x.dtype)
+    dtype = state.x.x.dtype
+    hot = None if ask is not None else _hot_wrench(wrench, batch, dtype)
 
-    def one_step(world, _):
-        w = hot
-        if control is not None:
-            seen = leave(model, p, world, batch)
-            given = control(model, seen)
-            _check_wrench(model, seen, given)
-            w = _hot_wrench(given, batch, state.x.x.dtype)
-        return advance(model, p, world, w), None
+    def controlled(p, world, _, model, closed):
+        seen = leave(model, p, world, batch)
+        return substeps(model, p, world, _hot_wrench(ask(model, seen, *closed), batch, dtype))
 
-    def run(world, count):
-        return jax.lax.scan(one_step, world, None, length=count)[0]
+    def one_step(world, cut):
+        if cut is not None:
+            world = jax.tree.map(lambda c: jnp.where(cut, jax.lax.stop_gradient(c), c), world)
+        if ask is not None:
+            return held(controlled, p, world, None, model, wrench)[0], None
+        return advance(model, p, world, hot), None
 
-    def block(world, _):
-        world = one_step(world, None)[0] if every == 1 else run(world, every)
+    def run(world, cuts, count, blocks):
+        """``count`` steps."""
+        while blocks and blocks[0] >= count:
+            blocks = blocks[1:]
+        if not blocks:
+            return jax.lax.scan(one_step, world, cuts, length=count)[0], None
+        return _in_blocks(run, world, cuts, count, blocks[0], blocks[1:])
+
+    def interval(world, x, blocks):
+        """The steps to the next sample."""
+        cuts, change = x
+        if every == 1:
+            world = one_step(world, None if cuts is None else cuts[0])[0]
+        else:
+            world = run(world, cuts, every, blocks)[0]
+        if nudge is not None:
+            world = nudge[0](p, world, change)
         return world, _sample(model, p, world)
 
-    first = _sample(model, p, world)
+    def sampled(world, xs, count, blocks):
+        """The steps to the next ``count`` samples."""
+        while blocks and blocks[0] // every >= count:
+            blocks = blocks[1:]
+        if not blocks or blocks[0] < every:
+            return jax.lax.scan(lambda world, x: interval(world, x, blocks), world, xs, length=count)
+        return _in_blocks(sampled, world, xs, count, blocks[0] // every, blocks[1:])
+
     samples, rest = steps // every, steps % every
+    cuts = None if truncate is None or truncate >= steps else np.arange(steps) % truncate == 0
+    if cuts is not None:
+        cuts[0] = False
+    changes = None
+    if nudge is not None:
+        world = nudge[0](p, world, jax.tree.map(lambda c: c[0], nudge[1]))
+        changes = jax.tree.map(lambda c: c[1:], nudge[1])
+    first = _sample(model, p, world)
     later = None
     if samples:
-        world, later = jax.lax.scan(block, world, None, length=samples)
+        inside = None if cuts is None else cuts[: samples * every].reshape(samples, every)
+        world, later = sampled(world, (inside, changes), samples, blocks)
     if rest:
-        world = run(world, rest)
+        world = run(world, None if cuts is None else cuts[samples * every :], rest, blocks)[0]
 
     def joined(a, b):
         """(k..., B) and (T, k..., B) -> (batch..., T + 1, k...)."""
@@ -169,20 +304,76 @@ def _rollout_batch(model: Model, state: State, wrench, steps: int, every: int, c
     return leave(model, p, world, batch), traj
 
 
-def _batched_call(core):
-    """``core(model, state, wrench)`` with a rule for vmap; differentiation goes through ``core`` itself."""
+def _in_blocks(run, world, xs, count: int, size: int, inner: tuple[int, ...]):
+    """``run(world, xs, count, inner)`` in blocks of ``size`` that reverse mode computes again, and a shorter one.
+
+    Only the world that enters a block is kept. Within a loop nothing else need be done for that: forward and reverse
+    pass are two loops, between which XLA finds no common subexpressions. Outside one it would merge the block
+    with what is to be computed again, and keep its intermediate values after all, hence ``prevent_cse``; inside that
+    would only cost, as its barriers stop fusion.
+    """
+    whole = count // size
+    fold = lambda c: jnp.reshape(c[: whole * size], (whole, size, *c.shape[1:]))
+    block = lambda world, xs: run(world, xs, size, inner)
+    if whole > 1:
+        block = jax.checkpoint(block, prevent_cse=False)
+        world, out = jax.lax.scan(block, world, jax.tree.map(fold, xs), length=whole)
+        out = jax.tree.map(lambda c: c.reshape(-1, *c.shape[2:]), out)
+    else:
+        world, out = jax.checkpoint(block)(world, jax.tree.map(lambda c: c[:size], xs))
+    rest = count - whole * size
+    if rest:
+        last = jax.checkpoint(lambda world, xs: run(world, xs, rest, inner))
+        world, more = last(world, jax.tree.map(lambda c: c[whole * size :], xs))
+        out = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), out, more)
+    return world, out
+
+
+def asked(model: Model, state: State, control):
+    """``control`` as a function (model, state, *closed) that closes over no traced value, and what it closed over."""
+    batch = batch_of(model, state.batch_shape)
+    seen = jax.eval_shape(lambda model, state: leave(model, *enter(model, state, batch), batch), model, state)
+
+    def checked(model, state):
+        wrench = control(model, state)
+        _check_wrench(model, state, wrench)
+        return wrench
+
+    return opened(checked, model, seen)
+
+
+def _derived(direct, core):
+    """``direct``, whose derivative is that of ``core``."""
+    call = jax.custom_jvp(direct)
+
+    def rule(primals, tangents):  # what does not change has no tangent: a gradient of the state costs none of the model
+        values, changes, put, _ = moving(primals, tangents)
+        out, change = jax.jvp(lambda *values: core(*put(values)), values, changes)
+        return _mapped_like(primals, out), change
+
+    call.defjvp(rule, symbolic_zeros=True)
+    return call
+
+
+def _mapped_like(given, out):
+    """``out``, mapped by every ``vmap`` that maps a part of ``given``.
+
+    The batching rule of ``direct`` maps all results; JAX wants the same of the rule of its derivative, in which
+    ``dt``, say, need not depend on what is mapped.
+    """
+    first = [jnp.ravel(c)[0] for c in jax.tree.leaves(given) if jnp.issubdtype(c.dtype, jnp.number) and c.size]
+    never = functools.reduce(jnp.logical_or, (c != c for c in first)) & False
+    return jax.tree.map(lambda c: jnp.where(never, c, c), out)
+
+
+def _batched_call(core, derived=None):
+    """``core(model, state, wrench)`` with a rule for vmap; differentiation goes through ``derived`` (None: ``core``)."""
 
     @jax.custom_batching.custom_vmap
     def direct(model, state, wrench):
         return core(model, state, wrench)
 
-    @jax.custom_jvp
-    def call(model, state, wrench):
-        return direct(model, state, wrench)
-
-    @call.defjvp
-    def _(primals, tangents):
-        return jax.jvp(core, primals, tangents)
+    call = _derived(direct, derived or core)
 
     @direct.def_vmap
     def _(size, batched, model, state, wrench):
@@ -216,15 +407,18 @@ def _grow_model(model: Model, batched: Model, size: int) -> Model:
 
 @jax.jit
 def _step(model, state, wrench):
-    return _batched_call(_step_batch)(model, state, wrench)
+    return _batched_call(_step_batch, functools.partial(_step_batch, safe=True))(model, state, wrench)
 
 
-@functools.partial(jax.jit, static_argnums=(3, 4))
-def _rollout(model, state, wrench, steps, every):
+@functools.partial(jax.jit, static_argnums=(3, 4, 5, 6))
+def _rollout(model, state, wrench, steps, every, blocks, truncate):
     core = lambda model, state, wrench: _rollout_batch(model, state, wrench, steps, every)
-    return _batched_call(core)(model, state, wrench)
+    derived = functools.partial(_rollout_batch, steps=steps, every=every, blocks=blocks, truncate=truncate, safe=True)
+    return _batched_call(core, derived)(model, state, wrench)
 
 
-@functools.partial(jax.jit, static_argnums=(2, 3, 4))
-def _rollout_with(model, state, steps, every, control):
-    return _rollout_batch(model, state, None, steps, every, control)
+@functools.partial(jax.jit, static_argnums=(2, 3, 4, 5, 6))
+def _rollout_with(model, state, steps, every, control, blocks, truncate):
+    ask, closed = asked(model, state, control)
+    core = functools.partial(_rollout_batch, steps=steps, every=every, ask=ask)
+    return _derived(core, functools.partial(core, blocks=blocks, truncate=truncate, safe=True))(model, state, closed)

@@ -13,11 +13,13 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
 
 from .bodies import Bodies
 from .detect import chosen, detect, everything
 from .events import advance_to_impacts, carried
-from .model import Model, Params, params
+from .model import BASE_NDIM, Model, Params, params
 from .solvers.base import Problem, Solution
 from .solvers.restitution import normal_velocity, targets
 from .solvers.rows import Impulses, Rows, add_rows, inverse_inertia, spread, take, take_tree
@@ -28,6 +30,17 @@ from .struct import struct
 from .xla import materialise, opaque_one
 
 FROZEN = int(Status.NOT_FINITE)
+
+
+def limit(dtype) -> float:
+    """Largest size of a state: 2.6e6 in float32, 2.4e51 in float64 (SI units).
+
+    The size is the root of the sum of squares of all positions, velocities, quaternions and angular velocities (their bound
+    |L| / least moment). Its sixth power is finite: a step forms energies and their quotients, whose derivatives have
+    fourth powers, times stiffness or 1 / mass. (Measured in float32: steps at speeds of 1e7 m/s have derivatives that
+    are not finite. At 2.6e6 m a position resolves 0.25 m.)
+    """
+    return float(jnp.finfo(dtype).max) ** (1 / 6)
 
 
 # --- public state <-> hot world ---
@@ -69,12 +82,106 @@ def _exactly_jvp(primals, tangents):
     return _exactly(*primals), tangents[0]
 
 
+def grown(state: State, batch: tuple[int, ...]) -> State:
+    """``state`` with all batch axes of the worlds; its own are the first of them."""
+    own = state.batch_shape
+    grow = lambda c: c.reshape(*own, *(1,) * (len(batch) - len(own)), *c.shape[len(own) :])
+    return jax.tree.map(lambda c: jnp.broadcast_to(grow(c), (*batch, *c.shape[len(own) :])), state)
+
+
+def unfit(model: Model, state: State) -> jax.Array:
+    """Worlds that cannot be stepped, bool (batch...): a number is not finite, or the state is out of range.
+
+    ``state`` is grown and has its memory.
+    """
+    s, memory, axes = model.structure, state.memory, len(state.batch_shape)
+    over = lambda c, first: c.sum(axis=tuple(range(first, c.ndim)))
+    moving = (state.x, state.v, *((state.q, state.w) if s.attitude else ()))
+    others = (state.kinematic, memory.contacts, memory.R)
+    size = sum(over(c * c, axes) for c in jax.tree.leaves(moving)) + sum(
+        over(c * 0, axes) for c in jax.tree.leaves(others)
+    )
+    bad = ~(size <= limit(size.dtype) ** 2)
+    for name in ("inertia", *BASE_NDIM):
+        value = getattr(model, name)
+        if value is None:
+            continue
+        if name.startswith("pair_"):  # there NaN means: not given
+            value = jnp.where(jnp.isnan(value), 0.0, value)
+        own = value.ndim - model.base_ndim(name)
+        wrong = over(value * 0, own) != 0
+        bad = bad | wrong.reshape(*wrong.shape, *(1,) * (axes - own))
+    return bad
+
+
+def marked(state: State, lost: jax.Array) -> State:
+    """``state`` with the worlds ``lost`` frozen from the start."""
+    return state._with(status=state.status | jnp.where(lost, jnp.uint32(FROZEN), jnp.uint32(0)))
+
+
+def harmless(model: Model, state: State, lost: jax.Array) -> tuple[Model, State]:
+    """``state`` with other bodies in the worlds ``lost``: at rest, a metre apart; a model of finite numbers.
+
+    Zero times a derivative at NaN is NaN: what is not finite must not enter a program that is differentiated, even
+    where nothing depends on the result.
+    """
+
+    def put(tree, *values):
+        at = lambda c: jnp.reshape(lost, (*lost.shape, *(1,) * (c.ndim - lost.ndim)))
+        leaves, kind = jax.tree.flatten(tree)
+        values = values if len(values) > 1 else values * len(leaves)
+        return kind.unflatten([jnp.where(at(c), jnp.asarray(v, c.dtype), c) for c, v in zip(leaves, values)])
+
+    memory, kinematic = state.memory, state.kinematic
+    if kinematic is not None:
+        line = -1.0 - np.arange(kinematic.x.x.shape[-1])
+        kinematic = kinematic._with(
+            x=put(kinematic.x, line, 0, 0), q=put(kinematic.q, 1, 0, 0, 0), v=put(kinematic.v, 0), w=put(kinematic.w, 0)
+        )
+    R = memory.R
+    state = marked(state, lost)._with(
+        x=put(state.x, np.arange(state.n), 0, 0),
+        v=put(state.v, 0),
+        q=put(state.q, 1, 0, 0, 0),
+        w=put(state.w, 0),
+        kinematic=kinematic,
+        memory=memory._with(
+            L=put(memory.L, 0),
+            R=None if R is None else put(R, 1, 0, 0, 0, 1, 0, 0, 0, 1),
+            contacts=put(memory.contacts, 0),
+        ),
+    )
+    finite = {}
+    for name in ("inertia", *BASE_NDIM):
+        value = getattr(model, name)
+        if value is not None:
+            fine = jnp.isfinite(value) | (jnp.isnan(value) if name.startswith("pair_") else False)
+            finite[name] = jnp.where(fine, value, 1.0)
+    return model._with(**finite), state
+
+
+def restored(state: State, given: State, lost: jax.Array) -> State:
+    """``state`` (final, or a trajectory of it) with the worlds ``lost`` as they were given, as constants: the derivative
+    of an objective at a number that is not finite is none itself, even where it is multiplied by zero.
+    """
+    samples = state.x.x.ndim > given.x.x.ndim
+
+    def back(new, old):
+        old = jax.lax.stop_gradient(jnp.expand_dims(old, lost.ndim) if samples else old)
+        return jnp.where(jnp.reshape(lost, (*lost.shape, *(1,) * (new.ndim - lost.ndim))), old, new)
+
+    names = ["x", "v", "q", "w", "kinematic"]
+    if state.memory is not None:
+        names.append("memory")
+        if given.memory.R is None:
+            given = given._with(memory=given.memory._with(R=state.memory.R))
+    return state._with(**{k: jax.tree.map(back, getattr(state, k), getattr(given, k)) for k in names})
+
+
 def enter(model: Model, state: State, batch: tuple[int, ...]) -> tuple[Params, World]:
     """Hot numbers and hot world of a public state whose leaves have batch axes ``batch``."""
     s = model.structure
-    own = state.batch_shape
-    grow = lambda c: c.reshape(*own, *(1,) * (len(batch) - len(own)), *c.shape[len(own) :])
-    state = jax.tree.map(lambda c: jnp.broadcast_to(grow(c), (*batch, *c.shape[len(own) :])), state)
+    state = grown(state, batch)
     one = opaque_one(model.dt)
     p = params(model, batch, one)
     hot = to_hot(state, batch)
@@ -167,31 +274,129 @@ def advance(model: Model, p: Params, world: World, wrench: Wrench | None) -> Wor
 
 
 def watched(model: Model, p: Params, world: World, wrench: Wrench | None, watch):
-    """``advance``, and what ``watch`` returned for every substep, leaves (substeps, ...); None for no watch.
+    """``advance``, and what ``watch`` returned for every substep, leaves (substeps, ..., B); None for no watch.
 
     watch(old, new, problem, solution): the worlds before and after a substep and what was solved in it, both None
     without contact; of an integrator with several stages those of the first. It adds operations of its own only.
     """
+    whole = lambda p, world, wrench: substeps(model, p, world, wrench, watch)
+    if watch is None:
+        return held(whole, p, world, wrench)
+    whole, closed = opened(whole, p, world, wrench)
+    return held(lambda p, world, wrench, closed: whole(p, world, wrench, *closed), p, world, wrench, closed)
+
+
+def substeps(model: Model, p: Params, world: World, wrench: Wrench | None, watch=None):
+    """The world after all parts of a step, whatever has become of it, and what ``watch`` says of each."""
     part = lambda world, _: _substep(model, p, world, wrench, watch)
     count = model.method.substeps
-    if count == 1:
-        new, seen = part(world, None)
-        seen = jax.tree.map(lambda c: c[None], seen)
-    else:
-        new, seen = jax.lax.scan(part, world, None, length=count)
-    return _freeze(world, new, p), seen
+    if count > 1:
+        return jax.lax.scan(part, world, None, length=count)
+    new, seen = part(world, None)
+    return new, jax.tree.map(lambda c: c[None], seen)
 
 
-def _freeze(old: World, new: World, p: Params) -> World:
-    """A world that is no longer finite stays at its last finite state and says so."""
-    total = sum(c * 0 for c in jax.tree.leaves(new.bodies))
-    total = materialise(total.sum(axis=0), p.one)
-    frozen = (new.status & jnp.uint32(FROZEN)) != 0
-    ok = (total == 0) & ~frozen
-    status = jnp.where(total == 0, new.status, new.status | jnp.uint32(FROZEN))
-    new = new._with(step=new.step + 1)
-    kept = jax.tree.map(lambda a, b: jnp.where(ok, a, b), new, old)
-    return kept._with(status=status)
+def held(step, p: Params, world: World, wrench, *others):
+    """``step(p, world, wrench, *others) -> (World, seen)``, where a world that is lost in it stays as it was.
+
+    So does its derivative: it is the identity with respect to ``world``, and zero with respect to the rest. A lost
+    world may have any derivative in the step, and zero times an infinite one is NaN, which a sum over worlds would
+    carry into numbers that they share. Hence tangents are zero before they enter the step as well as behind it, in
+    forward mode and so, transposed, in reverse mode; shared numbers of ``p`` and ``wrench`` become one for each world
+    there. ``others`` may have any shapes; what a lost world does to their derivatives is left to ``step``.
+    ``step`` closes over static values only.
+    """
+
+    @jax.custom_jvp
+    def call(p, world, wrench, *others):
+        new, seen = step(p, world, wrench, *others)
+        return _freeze(world, new, p)[0], seen
+
+    def rule(primals, tangents):
+        p, world, *_ = primals
+        values, changes, put, at = moving(primals, tangents)
+        count = len(jax.tree.leaves(primals[:3]))
+        wide = lambda c: jnp.broadcast_to(c, (*jnp.shape(c)[:-1], *world.step.shape))
+        each = lambda f, leaves: [f(c) if i < count else c for i, c in zip(at, leaves)]
+        real = lambda c: jnp.issubdtype(c.dtype, jnp.inexact)
+
+        def floats(*values):
+            leaves, tree = jax.tree.flatten(step(*put(values)))
+            return [c for c in leaves if real(c)], ([None if real(c) else c for c in leaves], tree)
+
+        floating, linear, (leaves, tree) = jax.linearize(floats, *each(wide, values), has_aux=True)
+        given = iter(floating)
+        new, seen = tree.unflatten([next(given) if c is None else c for c in leaves])
+        kept, ok = _freeze(world, new, p)
+        slopes = iter(linear(*each(lambda c: jnp.where(ok, wide(c), 0.0), changes)))
+
+        def ahead(c, before=None):
+            """Tangent of a result: that of the step, or the one before it."""
+            if not real(c):
+                return np.zeros(c.shape, jax.dtypes.float0)
+            slope = next(slopes)
+            if slope.shape[-1:] != ok.shape:  # of all worlds together
+                return slope
+            return jnp.where(ok, slope, 0.0 if isinstance(before, SymbolicZero) or before is None else before)
+
+        flat, kind = jax.tree.flatten(kept)
+        change = kind.unflatten([ahead(c, before) for c, before in zip(flat, kind.flatten_up_to(tangents[1]))])
+        return (kept, seen), (change, jax.tree.map(ahead, seen))
+
+    call.defjvp(rule, symbolic_zeros=True)
+    return call(p, world, wrench, *others)
+
+
+def moving(primals, tangents):
+    """Of a rule with symbolic zeros: the leaves that change, their changes, a function that puts other values for
+    them into the tree of ``primals``, and which leaves they are.
+    """
+    leaves, tree = jax.tree.flatten(primals)
+    changes = tree.flatten_up_to(tangents)
+    at = [i for i, c in enumerate(changes) if not isinstance(c, SymbolicZero)]
+
+    def put(values):
+        merged = list(leaves)
+        for i, value in zip(at, values):
+            merged[i] = value
+        return tree.unflatten(merged)
+
+    return [leaves[i] for i in at], [changes[i] for i in at], put, at
+
+
+def opened(f, *examples):
+    """``f`` as a function (*examples, *closed) that closes over no traced value, and the values it closed over.
+
+    A rule of differentiation must not close over any. (``jax.closure_convert`` leaves those in that cannot have a
+    derivative, such as random keys.)
+    """
+    closed, shape = jax.make_jaxpr(f, return_shape=True)(*examples)
+    count, tree = len(jax.tree.leaves(examples)), jax.tree.structure(shape)
+
+    def g(*args):
+        leaves = jax.tree.leaves(args)
+        return tree.unflatten(jax.core.eval_jaxpr(closed.jaxpr, leaves[count:], *leaves[:count]))
+
+    return g, list(closed.consts)
+
+
+def _freeze(old: World, new: World, p: Params) -> tuple[World, jax.Array]:
+    """A world that is no longer finite or leaves the range stays at its last state in range and says so.
+
+    Also whether a world made the step, (B,).
+    """
+    bodies = new.bodies
+    size = sum(c * c for c in jax.tree.leaves(bodies._with(L=None)))
+    if bodies.L is not None:
+        moments = p.inertia.moments
+        least = moments if p.inertia.isotropic else jnp.minimum(jnp.minimum(moments.x, moments.y), moments.z)
+        size = size + bodies.L.dot(bodies.L) * (1.0 / (least * least))
+    size = materialise(size.sum(axis=0), p.one)
+    fits = size <= limit(size.dtype) ** 2  # false for NaN
+    ok = fits & ((new.status & jnp.uint32(FROZEN)) == 0)
+    status = jnp.where(fits, new.status, new.status | jnp.uint32(FROZEN))
+    kept = where(ok, new._with(step=new.step + 1), old)
+    return kept._with(status=status), ok
 
 
 def _substep(model: Model, p: Params, world: World, wrench: Wrench | None, watch):
@@ -209,11 +414,11 @@ def _solved(model: Model, p: Params, world: World, wrench: Wrench | None):
     if model.method.solver.level == "force":
         return _force_step(model, p, world, wrench)
     nominal = None
-    if model.method.events:
+    if model.method.events and any(g.restitution for g in s.groups):
         world, left, more = _to_impacts(model, p, world, wrench)
         p, nominal = p._with(h=left), p.h
     old = world.bodies
-    contacts = detect(s, p, world, model.method.contact.reach)
+    contacts = detect(s, p, world, model.method.reach)
     if nominal is not None:  # impulses are kept as those of a whole step
         rest = lambda c, meets: c._with(
             warm=jax.tree.map(lambda x: x * (p.h / nominal), c.warm),
@@ -222,7 +427,9 @@ def _solved(model: Model, p: Params, world: World, wrench: Wrench | None):
         contacts = tuple(rest(c, meets) for c, meets in zip(contacts, more))
     a, tau = acceleration(p, wrench, old)
     v, L = integrator.kick(old, a, tau, p.inertia, p.h)
-    problem = _problem(p, old, v, L, contacts)._with(contact=model.method.contact, nominal=nominal)
+    problem = _problem(p, old, v, L, contacts)._with(
+        contact=model.method.contact, nominal=nominal, smoothing=p.smoothing
+    )
     solution = model.method.solver.solve(problem)
     if any(rows.e is not None and rows.slots > 1 for rows in problem.rows):
         solution = _passive(p, problem, solution)
@@ -256,9 +463,10 @@ def _to_impacts(model: Model, p: Params, world: World, wrench: Wrench | None):
     """What ``events.advance_to_impacts`` gives."""
     support = turn = zeros_like(world.bodies.v)
     selected = []
-    contacts = detect(model.structure, p, world, model.method.contact.reach)
+    contacts = detect(model.structure, p, world, model.method.reach)
     for g, gp, c in zip(model.structure.groups, p.groups, contacts):
-        selected.append(everything(g, gp) if c.pairs is None else chosen(g, gp, c.pairs))
+        impacts = everything(g, gp) if c.pairs is None else chosen(g, gp, c.pairs)
+        selected.append(impacts if g.restitution else None)
         J = c.rows.n * c.warm.n
         if c.warm.t1 is not None:
             t1, t2 = c.rows.tangents
@@ -341,7 +549,7 @@ def _force_step(model: Model, p: Params, world: World, wrench: Wrench | None):
     record = []
 
     def force(bodies: Bodies):
-        contacts = detect(s, p, world._with(bodies=bodies), model.method.contact.reach)
+        contacts = detect(s, p, world._with(bodies=bodies), model.method.reach)
         a, tau = acceleration(p, wrench, bodies)
         v, L = bodies.v if a is None else bodies.v + a * p.h, bodies.L
         problem = _problem(p, bodies, v, L, contacts)

@@ -79,6 +79,15 @@ def test_stability_maps_are_resumed_and_drawn(tmp_path):
     assert read()["maps"]["mass_two"] == before and {"stability_map.png", "stability_map_height.png"} <= drawn()
 
 
+def test_gradient_uses_writes_a_page(tmp_path):
+    for package in ("optax", "scipy", "matplotlib"):
+        pytest.importorskip(package)
+    quick("gradient_uses.py", tmp_path, "--uses", "aim")
+    row = json.loads((tmp_path / "gradient_uses.json").read_text())["uses"]["aim"]
+    assert min(row["gradient"]["losses"]) < row["gradient"]["losses"][0] and row["zeroth_order"]["evaluations"] == 8
+    assert "| aim |" in (tmp_path / "gradient_uses.md").read_text() and (tmp_path / "gradient_uses.png").stat().st_size
+
+
 def test_unknown_map_is_refused(tmp_path):
     done = run("stability_maps.py", "--maps", "rocket", "--out", tmp_path)
     assert done.returncode == 2 and "unknown map 'rocket'" in done.stderr

@@ -361,7 +361,9 @@ def _with_derivative(f):
     def value(p, args):
         return p
 
-    value.defjvp(lambda primals, tangents: (primals[0], implicit.tangent(f, primals[1], tangents[1])), symbolic_zeros=True)
+    value.defjvp(
+        lambda primals, tangents: (primals[0], implicit.tangent(f, primals[1], tangents[1])), symbolic_zeros=True
+    )
     return value
 
 
