@@ -11,7 +11,8 @@ of a sphere to a box, so no thin wall is jumped over. The search is not differen
 collides has the derivative dt = -(dphi/dtheta) dtheta / (dphi/dt), as phi(t(theta), theta) = 0.
 
 Groups whose pairs mention no restitution have no events: their impacts are resolved within the step. (Zero is a value:
-restitution=0.0 has them.) An approach slower than max((1 - e) / 2, REST) h |a| (a: what the forces but contact give both bodies) is left to the
+restitution=0.0 has them.) An approach slower than max((1 - e) / 2, REST) h |a| (a: what the forces but contact give
+both bodies) is left to the
 step: the bodies have come to rest. One pair at a time: of simultaneous impacts the order is that of the groups.
 Gradients: exact, of the event map; where the number or the order of the impacts changes, the motion is
 discontinuous and has none.

@@ -1,7 +1,7 @@
 """Layer 1: derivatives of the solution of an equation that do not go through the iteration that found it.
 
-With F(p, theta) = 0 the solution p(theta) has the derivative dp = -(dF/dp)^-1 (dF/dtheta) dtheta. The rule below is itself
-made of differentiable operations, evaluated at p(theta), so that its derivative is right too: F(p(theta), theta)
+With F(p, theta) = 0 the solution p(theta) has the derivative dp = -(dF/dp)^-1 (dF/dtheta) dtheta. The rule below is
+itself made of differentiable operations, evaluated at p(theta), so that its derivative is right too: F(p(theta), theta)
 vanishes identically, hence so does what the neglected part of the rule would add. (A custom reverse rule would forbid
 forward mode, and a one-step form alone, whose second derivatives are wrong, is no substitute.)
 
@@ -9,8 +9,8 @@ Where JAX splits a loop for reverse mode it takes the functions in what is known
 step of the iteration is one whose own derivative is right to first order (the one-step form), which makes
 second derivatives right there as well.
 
-Source: implicit function theorem; Blondel et al. 2022, "Efficient and modular implicit differentiation"; Bolte, Pauwels,
-Vaiter 2023, "One-step differentiation of iterative algorithms".
+Source: implicit function theorem; Blondel et al. 2022, "Efficient and modular implicit differentiation"; Bolte,
+Pauwels, Vaiter 2023, "One-step differentiation of iterative algorithms".
 """
 
 from __future__ import annotations

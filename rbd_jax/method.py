@@ -33,7 +33,8 @@ class Method:
         their masses differ by more than 10 : 1.
       substeps: steps inside a step of dt; None: 1, or for "tgs" and "penalty" as many as keep a substep within
         1/240 s at the dt of ``build``.
-      events: with pairs that mention restitution, impacts a world may have in a (sub)step at their own instant, with the position and normal they
+      events: with pairs that mention restitution, impacts a world may have in a (sub)step at their own instant, with
+        the position and normal they
         have there; what follows the last of them is a step of the remaining length. 0: none, an impact is
         resolved at the normal of the start of the step. An approach slower than max((1 - e) / 2, 0.02) h |a| is no
         event: the body has come to rest.

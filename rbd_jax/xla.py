@@ -32,6 +32,6 @@ def materialise(tree, one: jax.Array | float | None = 1.0):
 
 
 def materialise_linear(tree, like: jax.Array, one):
-    """``materialise`` in a way that JAX sees is linear: the divisors are made of ``like``, an array of the leaves' shape."""
+    """``materialise`` in a way that JAX sees is linear: the divisors are made of ``like``, of the leaves' shape."""
     unit = jax.lax.stop_gradient(one + 0.0 * like)
     return jax.tree.map(lambda x: x / unit, tree)

@@ -15,7 +15,8 @@ Differs: fixed iteration counts; the last iteration is a full Newton step. Where
 has its own step length.
 
 Cost: ``iterations`` linear systems as in ``newton``, and ``iterations x search`` evaluations of the law.
-Gradients: implicit, of the converged problem: exact where a world is not ``unconverged``; all orders, forward and reverse.
+Gradients: implicit, of the converged problem: exact where a world is not ``unconverged``; first and second
+order, forward and reverse.
 """
 
 from __future__ import annotations

@@ -73,8 +73,8 @@ class Sym6:
 
 @struct
 class Lagging:
-    """G of rows whose friction follows their normal impulse: ``symmetric``, and in the column of the normal velocity the
-    entries ``column`` of the friction rows (its n is not used). Its Newton systems are not symmetric.
+    """G of rows whose friction follows their normal impulse: ``symmetric``, and in the column of the normal velocity
+    the     entries ``column`` of the friction rows (its n is not used). Its Newton systems are not symmetric.
     """
 
     symmetric: Sym3 | Sym6

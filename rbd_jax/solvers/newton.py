@@ -37,7 +37,7 @@ Source: Howell et al. 2022 (Dojo), "Gradients" (the central path of an interior-
 
 Cost: ``iterations`` 6x6 systems a body, or dense 6n x 6n systems where bodies touch each other (up to about 16).
 Gradients: with ``polish`` = 0 exact, of the iteration as it runs. Else implicit, of the converged problem: one more
-system, no stored iterates, exact where a world is not ``unconverged``; all orders, forward and reverse.
+system, no stored iterates, exact where a world is not ``unconverged``; first and second order, forward and reverse.
 """
 
 from __future__ import annotations
