@@ -96,12 +96,13 @@ def unfit(model: Model, state: State) -> jax.Array:
     """
     s, memory, axes = model.structure, state.memory, len(state.batch_shape)
     over = lambda c, first: c.sum(axis=tuple(range(first, c.ndim)))
-    moving = (state.x, state.v, *((state.q, state.w) if s.attitude else ()))
-    others = (state.kinematic, memory.contacts, memory.R)
-    size = sum(over(c * c, axes) for c in jax.tree.leaves(moving)) + sum(
-        over(c * 0, axes) for c in jax.tree.leaves(others)
-    )
+    each = lambda tree: jax.tree.leaves(tree)
+    size = over(sum(c * c for c in each((state.x, state.v, *((state.q, state.w) if s.attitude else ())))), axes)
+    for tree in (state.kinematic, memory.R, *memory.contacts):  # leaves of one shape: a single sum for each
+        if tree is not None:
+            size = size + over(sum(c * 0 for c in each(tree)), axes)
     bad = ~(size <= limit(size.dtype) ** 2)
+    shared = []
     for name in ("inertia", *BASE_NDIM):
         value = getattr(model, name)
         if value is None:
@@ -109,9 +110,12 @@ def unfit(model: Model, state: State) -> jax.Array:
         if name.startswith("pair_"):  # there NaN means: not given
             value = jnp.where(jnp.isnan(value), 0.0, value)
         own = value.ndim - model.base_ndim(name)
-        wrong = over(value * 0, own) != 0
-        bad = bad | wrong.reshape(*wrong.shape, *(1,) * (axes - own))
-    return bad
+        if own:
+            wrong = over(value * 0, own) != 0
+            bad = bad | wrong.reshape(*wrong.shape, *(1,) * (axes - own))
+        else:
+            shared.append(value.ravel())
+    return bad | ((jnp.concatenate(shared) * 0).sum() != 0)
 
 
 def marked(state: State, lost: jax.Array) -> State:

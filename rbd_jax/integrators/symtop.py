@@ -37,17 +37,51 @@ def rotate(q: Quat, L: Vec3, inertia: Inertia, h, schedule) -> Quat:
     iy = 1.0 / i.y
     a, b = h * (1.0 / i.z - iy), h * (1.0 / i.x - iy)
     e = exp(L * (h * iy), norm_correction(q))
-    p = q.rotate_inv(L)
+    return e @ alternate(q, q.rotate_inv(L), a, b, schedule)
+
+
+def alternate(q: Quat, p: Vec3, a, b, schedule) -> Quat:
+    """The turns B, A, B, ... by the fractions in ``schedule``; p = R^T L turns back.
+
+    Derivatives of more than three go through a loop: XLA would compute the chain from its start for each of the numbers
+    that a derivative keeps, and compile for minutes.
+    """
+    turns = lambda q, p, a, b: _in_line(q, p, a, b, schedule)
+    if len(schedule) <= 3:
+        return turns(q, p, a, b)
+    call = jax.custom_jvp(turns)
+    call.defjvp(lambda values, changes: jax.jvp(lambda *args: _in_loop(*args, schedule), values, changes))
+    return call(q, p, a, b)
+
+
+def _in_line(q, p, a, b, schedule):
     for n, fraction in enumerate(schedule):
-        if n % 2:  # A: turn about z; p = R^T L turns back
-            s, c = half_angle(fraction * a * p.z)
-            q, (s2, c2) = spin_z(q, s, c), double(s, c)
-            p = Vec3(c2 * p.x + s2 * p.y, c2 * p.y - s2 * p.x, p.z)
-        else:  # B: turn about x
-            s, c = half_angle(fraction * b * p.x)
-            q, (s2, c2) = spin_x(q, s, c), double(s, c)
-            p = Vec3(p.x, c2 * p.y + s2 * p.z, c2 * p.z - s2 * p.y)
-    return e @ q
+        q, p = _about_z(q, p, fraction * a) if n % 2 else _about_x(q, p, fraction * b)
+    return q
+
+
+def _in_loop(q, p, a, b, schedule):
+    pairs = jnp.asarray((*schedule, 0.0), q.w.dtype).reshape(-1, 2)
+
+    def pair(carry, fractions):
+        q, p = _about_x(*carry, fractions[0] * b)
+        return _about_z(q, p, fractions[1] * a), None
+
+    return jax.lax.scan(pair, (q, p), pairs)[0][0]
+
+
+def _about_x(q, p, t):
+    """B: q turns by t p_x about x."""
+    s, c = half_angle(t * p.x)
+    q, (s2, c2) = spin_x(q, s, c), double(s, c)
+    return q, Vec3(p.x, c2 * p.y + s2 * p.z, c2 * p.z - s2 * p.y)
+
+
+def _about_z(q, p, t):
+    """A: q turns by t p_z about z."""
+    s, c = half_angle(t * p.z)
+    q, (s2, c2) = spin_z(q, s, c), double(s, c)
+    return q, Vec3(c2 * p.x + s2 * p.y, c2 * p.y - s2 * p.x, p.z)
 
 
 STRANG = (0.5, 1.0, 0.5)

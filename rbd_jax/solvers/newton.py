@@ -186,9 +186,9 @@ class NewtonLagged(Solver):
         residual = keep(residual)
         ones = tuple(jnp.ones_like(b) for b in bound)
         gs, rs = [], []
-        _, more = jax.jvp(lambda bound: tuple(b for b, _ in self._linearised(system, bound, p, u)), (bound,), (ones,))
-        linear = self._linearised(system, bound, p, u)
-        for c, law, (_, g), q, x, e, r in zip(cs, system.laws, linear, p, u, more, residual):
+        split = lambda bound: zip(*self._linearised(system, bound, p, u))
+        _, more, linear = jax.jvp(lambda bound: tuple(split(bound)), (bound,), (ones,), has_aux=True)
+        for c, law, g, q, x, e, r in zip(cs, system.laws, linear, p, u, more, residual):
             if c.friction:
                 acts = c.live if system.smooth is not None else _acts(c, law, q, x)
                 e = jax.tree.map(lambda y: jnp.where(acts, y, 0.0), e)
