@@ -22,11 +22,11 @@ class GradientNorms:
     Attributes:
       steps_left: from the sample to the end, int32 (samples,), falling from all steps.
       position: of dJ/dpos [J per m], (..., samples). velocity: of dJ/dvel [J per m/s].
-      attitude: of the derivative by a rotation about the world's axes [J per rad]. omega: of dJ/domega [J per rad/s].
-        Both are None where the scene models no attitude.
+      attitude: of the derivative by a rotation about the world's axes [J per rad].
+      omega: of dJ/domega [J per rad/s]. Both are None where the scene models no attitude.
 
-    Each holds the others still: ``position`` and ``attitude`` at the same vel and omega, ``omega`` at the same quat, and all
-    at the impulses that the solver remembers.
+    Each holds the others still: ``position`` and ``attitude`` at the same vel and omega, ``omega`` at the same quat,
+    and all at the impulses that the solver remembers.
     """
 
     steps_left: jax.Array
@@ -47,11 +47,12 @@ def gradient_norms(
 ) -> GradientNorms:
     """Norms of the derivative of the end of a rollout by every state on the way, in one reverse pass.
 
-    Norms that grow with ``steps_left`` say that gradients explode (a chaotic or a stiff motion), norms that fall that they
-    vanish (friction, inelastic impacts), and where: ``rollout(truncate=...)`` may then cut them in time.
+    Norms that grow with ``steps_left`` say that gradients explode (a chaotic or a stiff motion), norms that fall that
+    they vanish (friction, inelastic impacts), and where: ``rollout(truncate=...)`` may then cut them in time.
 
     Args:
-      model, state, steps, every, control, checkpoint: as for :func:`rbd_jax.rollout`; samples are those of its trajectory.
+      model, state, steps, every, control, checkpoint: as for :func:`rbd_jax.rollout`; samples are those of its
+        trajectory.
       objective: final State -> scalar; or an array of the batch axes, one number for each world.
 
     Returns:

@@ -130,7 +130,8 @@ def blocks_of(name: str, checkpoint) -> tuple[int, ...]:
     falls = all(_whole(size, 1) for size in sizes) and all(a > b for a, b in zip(sizes, sizes[1:]))
     if not falls or checkpoint == ():
         raise ValueError(
-            f"{name}: checkpoint = {checkpoint!r} must be None, an integer >= 1 or a tuple of decreasing ones, outer first"
+            f"{name}: checkpoint = {checkpoint!r} must be None, an integer >= 1 or a tuple of decreasing ones, "
+            "outer first"
         )
     return tuple(int(size) for size in sizes)
 
@@ -387,7 +388,7 @@ def _mapped_like(given, out):
 
 
 def _batched_call(core, derived=None):
-    """``core(model, state, wrench)`` with a rule for vmap; differentiation goes through ``derived`` (None: ``core``)."""
+    """``core(model, state, wrench)`` with a rule for vmap; derivatives are those of ``derived`` (None: ``core``)."""
 
     @jax.custom_batching.custom_vmap
     def direct(model, state, wrench):

@@ -35,10 +35,10 @@ FROZEN = int(Status.NOT_FINITE)
 def limit(dtype) -> float:
     """Largest size of a state: 2.6e6 in float32, 2.4e51 in float64 (SI units).
 
-    The size is the root of the sum of squares of all positions, velocities, quaternions and angular velocities (their bound
-    |L| / least moment). Its sixth power is finite: a step forms energies and their quotients, whose derivatives have
-    fourth powers, times stiffness or 1 / mass. (Measured in float32: steps at speeds of 1e7 m/s have derivatives that
-    are not finite. At 2.6e6 m a position resolves 0.25 m.)
+    The size is the root of the sum of squares of all positions, velocities, quaternions and angular velocities (their
+    bound |L| / least moment). Its sixth power is finite: a step forms energies and their quotients, whose derivatives
+    have fourth powers, times stiffness or 1 / mass. (Measured in float32: steps at speeds of 1e7 m/s have derivatives
+    that are not finite. At 2.6e6 m a position resolves 0.25 m.)
     """
     return float(jnp.finfo(dtype).max) ** (1 / 6)
 
@@ -165,8 +165,8 @@ def harmless(model: Model, state: State, lost: jax.Array) -> tuple[Model, State]
 
 
 def restored(state: State, given: State, lost: jax.Array) -> State:
-    """``state`` (final, or a trajectory of it) with the worlds ``lost`` as they were given, as constants: the derivative
-    of an objective at a number that is not finite is none itself, even where it is multiplied by zero.
+    """``state`` (final, or a trajectory of it) with the worlds ``lost`` as they were given, as constants: the
+    derivative of an objective at a number that is not finite is none itself, even where it is multiplied by zero.
     """
     samples = state.x.x.ndim > given.x.x.ndim
 

@@ -148,6 +148,33 @@ def _roll_truth(i):
     return jnp.stack([x + 0.5 * rolling, speed + rolling])
 
 
+def slider(dt, seconds, method="gradient"):
+    """A mass point with friction: a ball that can hardly be turned. Inputs: speed, friction, force."""
+    body = dataclasses.replace(_ball((0, 0, 0.1), mu=0.5), inertia=(1e9, 1e9, 1e9))
+    scene = rbd.Scene([body], [rbd.Geom(rbd.Plane(), friction=0.5)], gravity=(0, 0, -G))
+
+    def change(m, s, i):
+        wrench = rbd.Wrench(_along(0, i[2]))
+        return m.replace(friction=i[1] * jnp.ones_like(m.friction)), s.replace(vel=_along(0, i[0])), wrench
+
+    return rollout(scene, dt, seconds, change, lambda f: (f.pos[0, 0], f.vel[0, 0]), method)
+
+
+def _slides(seconds, given):
+    """``slider`` with some of its inputs given, as (dt) -> function of the others."""
+
+    def at(dt):
+        run = slider(dt, seconds)
+
+        def f(i):
+            free = iter(i)
+            return run(jnp.stack([next(free) if x is None else jnp.asarray(x, float) for x in given]))
+
+        return f
+
+    return at
+
+
 def _landed(dt):
     """A ball without restitution after it has landed. Inputs: height over its rest, upward speed."""
     scene = rbd.Scene([_ball()], [rbd.Plane()])
@@ -228,6 +255,42 @@ CASES = {
         lambda i: jnp.stack([5 / 14 * i[0], 5 / 7 * i[0]]),
         "dx/dF = 5 T^2 / (14 m)",
         5e-3,
+        steps=COARSE,
+        order=0.8,
+    ),
+    "slide": Case(
+        "sliding",
+        ("v0", "mu"),
+        ("x", "v"),
+        ((2.0, 0.5),),
+        _slides(0.25, (None, None, 0.0)),
+        lambda i: jnp.stack([0.25 * i[0] - 0.5 * i[1] * G * 0.0625, i[0] - i[1] * G * 0.25]),
+        "dx/dv0 = T, dx/dmu = -g T^2 / 2",
+        2e-2,
+        steps=COARSE,
+        order=0.8,
+    ),
+    "stop": Case(
+        "slide to stop, then stick",
+        ("v0", "mu"),
+        ("x", "v"),
+        ((2.0, 0.5),),
+        _slides(1.0, (None, None, 0.0)),
+        lambda i: jnp.stack([i[0] ** 2 / (2 * i[1] * G), 0.0 * i[0]]),
+        "dx/dv0 = v0 / (mu g), dx/dmu = -v0^2 / (2 mu^2 g)",
+        2e-2,
+        steps=COARSE,
+        order=0.8,
+    ),
+    "push": Case(
+        "pushed above the limit of friction",
+        ("mu", "F"),
+        ("x", "v"),
+        ((0.5, 8.0),),
+        _slides(0.5, (0.0, None, None)),
+        lambda i: jnp.stack([0.125 * (i[1] - i[0] * G), 0.5 * (i[1] - i[0] * G)]),
+        "dx/dF = T^2 / (2 m), dx/dmu = -g T^2 / 2",
+        2e-2,
         steps=COARSE,
         order=0.8,
     ),

@@ -35,7 +35,7 @@ def step_operations(scene, method="fast", batch=4):
     """Operations of one step of the hot loop."""
     model, state = rbd.build(scene, method=method)
     state = with_memory(model, rbd.batch(state, batch))
-    jaxpr = jax.make_jaxpr(lambda m, s: _rollout_batch(m, s, None, 2, 2))(model, state)
+    jaxpr = jax.make_jaxpr(lambda m, s: _rollout_batch(m, s, None, 4, 2))(model, state)
     loops = []
 
     def find(jaxpr):

@@ -98,3 +98,24 @@ def test_unknown_scene_is_refused(tmp_path):
     done = run("throughput.py", "--scenes", "rocket", "--out", tmp_path)
     assert done.returncode == 2 and "unknown scene 'rocket'" in done.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_large_worlds_write_rows(tmp_path):
+    quick("large_worlds.py", tmp_path)
+    rows = json.loads((tmp_path / "large_worlds.json").read_text())["rows"]
+    assert {"spheres", "boxes on static boxes"} == {r["scene"] for r in rows}
+    assert all(r["finite"] and r["ours_s"] > 0 and r["mujoco_s"] > 0 and r["contacts"] > 0 for r in rows)
+    assert "| spheres |" in (tmp_path / "large_worlds.md").read_text()
+
+
+def test_gradient_costs_are_written(tmp_path):
+    quick("gradients.py", tmp_path, "--rows", "cost")
+    rows = [json.loads(line) for line in (tmp_path / "gradients.jsonl").read_text().splitlines()]
+    ours = [r for r in rows if r["row"] == "cost" and r["engine"] == "rbd_jax"]
+    assert ours and all(r["finite"] and r["forward_s"] > 0 and r["reverse_B"] > 0 for r in ours)
+
+
+def test_the_gradient_contract_is_a_page(tmp_path):
+    done = run("gradient_contract.py", "--quick", "--out", tmp_path / "gradients.md")
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "| free flight |" in (tmp_path / "gradients.md").read_text()

@@ -1,6 +1,7 @@
 """The gradient contract: derivatives against closed forms, forward and reverse, float64."""
 
 import dataclasses
+import functools
 
 import gradient_cases as cases
 import jax
@@ -71,6 +72,86 @@ def test_second_derivatives_across_an_impact():
     np.testing.assert_allclose(twice, truth, rtol=1e-8, atol=1e-8)
 
 
+def test_a_push_below_the_limit_of_friction_moves_nothing(contract):
+    """dx/dF of a held body, relative to that of a sliding one, falls with the speed that regularises friction."""
+    speeds = (1e-4, 1e-5, 1e-6)
+    found = []
+    for speed in speeds:
+        solver = NewtonLagged(iterations=6, polish=3, slip_speed=speed)
+        run = cases.slider(1 / 240, 0.5, dataclasses.replace(rbd.PRESETS["gradient"], solver=solver))
+        slope = jax.jit(jax.jacfwd(lambda F, run=run: run(jnp.stack([0.0 * F, 0.5 + 0.0 * F, F]))[0]))(2.5)
+        found.append(float(slope) / 0.125)
+    contract(
+        "closed",
+        event="stick: pushed below the limit of friction",
+        derivatives="d(x)/d(F)",
+        formula="0; slip speeds 1e-4, 1e-5, 1e-6 m/s, relative to T^2 / (2 m)",
+        steps=(1 / 240,),
+        errors=found,
+        bar=1e-3,
+    )
+    assert 0 <= found[0] <= 1e-3 and found[1] <= 0.2 * found[0] and found[2] <= 0.2 * found[1], found
+
+
+# --- where there is no derivative ---
+
+
+def test_the_switch_from_stick_to_slip_has_one_sided_derivatives(contract):
+    run = cases.slider(1 / 240, 0.5)
+    slope = jax.jit(jax.jacfwd(lambda F: run(jnp.stack([0.0 * F, 0.5 + 0.0 * F, F]))[0]))
+    limit = 0.5 * cases.G
+    held, slides = float(slope(0.98 * limit)), float(slope(1.02 * limit))
+    contract(
+        "none",
+        event="push at exactly the limit of friction",
+        why="sticking on one side, sliding on the other",
+        found=f"d(x)/d(F) = {held:.1e} at 98 %, {slides:.3f} at 102 % (T^2 / 2 m = 0.125)",
+    )
+    assert held < 2e-3 and abs(slides - 0.125) < 0.01
+
+
+def test_the_derivative_grows_without_bound_towards_a_grazing_impact(contract):
+    f = cases.CASES["spheres"].function(1 / 10)
+    truth = cases.CASES["spheres"].truth
+    slope, exact = (jax.jit(jax.jacfwd(lambda y, g=g: g(jnp.stack([y, 3.0 + 0.0 * y]))[1])) for g in (f, truth))
+    gaps = (1e-2, 1e-4, 1e-6)
+    found = [float(slope(0.3 - gap)) for gap in gaps]
+    np.testing.assert_allclose(found, [float(exact(0.3 - gap)) for gap in gaps], rtol=1e-6)
+    missed = float(slope(0.3 + 1e-6))
+    contract(
+        "none",
+        event="grazing impact",
+        why="the instant of the impact is the root of a square root that vanishes",
+        found=f"d(yA)/d(offset) = {', '.join(f'{s:.3g}' for s in found)} at 1e-2, 1e-4, 1e-6 m inside, "
+        f"{missed:.3g} for a miss",
+    )
+    assert abs(found[2]) > 5 * abs(found[1]) > 25 * abs(found[0]) / 2 and missed == 0.0
+
+
+def test_the_order_of_two_impacts_decides_what_follows(contract):
+    """A ball hits two touching ones: one that is hit first takes more. The derivative is that of the order that is."""
+    bodies = [
+        cases._ball((x, 0, y), 1.0, None, 0.1, f"ball{k}") for k, (x, y) in enumerate([(-0.4, 0), (0, 0.1), (0, -0.1)])
+    ]
+    model, state = rbd.build(rbd.Scene(bodies, gravity=None), dt=1 / 30, method="gradient")
+
+    def after(offset):
+        s = state.replace(
+            pos=state.pos.at[1, 2].add(0.001).at[0, 2].add(offset), vel=jnp.zeros((3, 3)).at[0, 0].set(3.0)
+        )
+        return rbd.rollout(model, s, 8, every=8)[0].vel[0, 2]
+
+    both = jax.jit(jax.value_and_grad(after))
+    (low, _), (high, _) = both(0.0005 - 1e-5), both(0.0005 + 1e-5)
+    contract(
+        "none",
+        event="one body meets two others at the same instant",
+        why="their order decides the outcome, which jumps",
+        found=f"vz of the first = {float(low):.3f} and {float(high):.3f} m/s for offsets 20 um apart",
+    )
+    assert abs(high - low) > 0.1
+
+
 # --- smoothing ---
 
 
@@ -79,24 +160,27 @@ def smoothed(how):
     return dataclasses.replace(rbd.PRESETS["gradient"], solver=solver, events=0)
 
 
-def fall(method, speeds=None, height=0.5, steps=12):
-    """Final state of a ball that starts ``height`` above the plane, sliding, and its derivative in the height."""
+@functools.cache
+def faller(how):
+    """(height, smoothing) -> end state of a ball that starts above the plane, sliding, and its derivative in height."""
     scene = rbd.Scene([cases._ball((0, 0, 0.1), mu=0.5)], [rbd.Geom(rbd.Plane(), friction=0.5)])
-    model, state = rbd.build(scene, dt=1 / 120, method=method)
-    if speeds is not None:
-        model = model.replace(smoothing=jnp.asarray(speeds))
+    model, state = rbd.build(scene, dt=1 / 120, method=smoothed(how))
 
-    def end(h, model):
+    def end(h, speeds):
         s = state.replace(pos=cases._along(2, 0.1 + h), vel=cases._along(0, 1.0))
-        final = rbd.rollout(model, s, steps, every=steps)[0]
+        final = rbd.rollout(model if how is None else model.replace(smoothing=speeds), s, 12, every=12)[0]
         return jnp.concatenate([final.pos[0], final.vel[0], final.omega[0]])
 
-    return jax.jit(lambda h: jax.jvp(lambda h: end(h, model), (h,), (jnp.ones_like(h),)))(jnp.asarray(height))
+    return jax.jit(lambda h, speeds: jax.jvp(lambda h: end(h, speeds), (h,), (jnp.ones_like(h),)))
+
+
+def fall(how, speed=0.0, height=0.5):
+    return faller(how)(jnp.asarray(height), jnp.array([speed, speed]))
 
 
 def test_backward_smoothing_leaves_the_values_and_sees_contact_from_a_distance():
-    value, slope = fall(smoothed(None), height=0.3)
-    soft_value, soft_slope = fall(smoothed("backward"), (0.5, 0.5), height=0.3)
+    value, slope = fall(None, height=0.3)
+    soft_value, soft_slope = fall("backward", 0.5, height=0.3)
     np.testing.assert_array_equal(soft_value, value)
     assert np.abs(slope[3:]).max() == 0.0, "no contact, no influence of the height on the velocity"
     assert soft_slope[5] < -1e-4, "the plane pushes less from further away"
@@ -104,10 +188,10 @@ def test_backward_smoothing_leaves_the_values_and_sees_contact_from_a_distance()
 
 @pytest.mark.parametrize("how", ["forward", "backward"])
 def test_smoothing_is_annealed_to_the_contact_as_it_is(how):
-    value, slope = fall(smoothed(None), height=1e-4)
+    value, slope = fall(None, height=1e-4)
     differences = []
     for speed in (1e-1, 1e-2, 1e-3, 0.0):
-        soft_value, soft_slope = fall(smoothed(how), (speed, speed), height=1e-4)
+        soft_value, soft_slope = fall(how, speed, height=1e-4)
         differences.append(float(np.abs(soft_slope - slope).max()))
         if how == "backward":
             np.testing.assert_array_equal(soft_value, value)

@@ -27,14 +27,33 @@ def ball(name, pos, **kwargs):
     return rbd.Body(name, rbd.Sphere(0.1), pos=pos, mass=0.8, friction=0.4, restitution=0.3, **kwargs)
 
 
+def box(name, pos, half=(0.1, 0.12, 0.08), **kwargs):
+    return rbd.Body(name, rbd.Box(half), pos=pos, mass=1.2, friction=0.5, **kwargs)
+
+
 GROUND = rbd.Geom(rbd.Plane(), friction=0.6, restitution=0.1)
 MOVING = dict(vel=(0.4, -0.2, -0.3), omega=(0.3, 0.5, -0.2))
 SCENES = {
     "sphere-plane, sphere-sphere": rbd.Scene(
         [ball("a", (0, 0, 0.0995), **MOVING), ball("b", (0.15, 0.02, 0.228), vel=(-0.3, 0.1, -0.2))], [GROUND], dt=DT
     ),
+    "box-plane": rbd.Scene([box("a", (0, 0, 0.079), **MOVING)], [rbd.Geom(rbd.Plane(), friction=0.6)], dt=DT),
+    "sphere-box": rbd.Scene(
+        [
+            box("a", (0, 0, 0), **MOVING),
+            rbd.Body("b", rbd.Sphere(0.1), pos=(0.03, 0.02, 0.178), mass=0.8, friction=0.4),
+        ],
+        gravity=(0, 0, -9.81),
+        dt=DT,
+    ),
+    "box-box": rbd.Scene(
+        [box("a", (0, 0, 0), vel=(0.1, 0.05, 0.3)), box("b", (0.03, 0.02, 0.148), (0.07, 0.1, 0.07), **MOVING)],
+        gravity=(0, 0, -9.81),
+        dt=DT,
+    ),
 }
-EVERY = [("sphere-plane, sphere-sphere", "fast")]
+PRESETS = ("fast", "accurate", "gradient", "mujoco")
+EVERY = [(scene, preset) for scene in SCENES for preset in PRESETS]
 #: Leaves of the model that are differentiated where a scene has them.
 LEAVES = ("dt", "mass", "inertia", "gravity", "friction", "restitution", "radius", "half_extents", "static_pos")
 
@@ -50,7 +69,7 @@ def arguments(model, state):
 
 @functools.cache
 def program(scene, preset):
-    """model, state, jitted loss and jitted value_and_grad of it."""
+    """model, state and a loss of everything a derivative can be taken in."""
     with jax.enable_x64(True):
         model, state = rbd.build(SCENES[scene], method=preset)
 
@@ -65,37 +84,87 @@ def program(scene, preset):
             out = jnp.concatenate([final.pos, final.quat, 0.1 * final.vel, 0.1 * final.omega], axis=-1)
             return (out * jnp.cos(jnp.arange(out.size).reshape(out.shape))).sum()
 
-        return model, state, jax.jit(loss), jax.jit(jax.value_and_grad(loss))
+        return model, state, loss
 
 
 @pytest.mark.parametrize("scene, preset", EVERY)
 def test_every_leaf_has_the_derivative_of_the_map(scene, preset, contract):
-    model, state, loss, both = program(scene, preset)
+    """Reverse mode against central differences leaf by leaf, forward mode along all; finite at degenerate states."""
+    model, state, loss = program(scene, preset)
     args = arguments(model, state)
+    value, both = jax.jit(loss), jax.jit(jax.value_and_grad(loss))
     _, gradient = both(args)
     rng = np.random.default_rng(0)
-    worst = {}
+    directions, slopes, worst = {}, {}, {}
     for part, leaves in args.items():
-        for name, value in leaves.items():
-            direction = rng.normal(size=value.shape) if value.ndim else np.ones(())
+        for name, leaf in leaves.items():
+            direction = rng.normal(size=leaf.shape) if leaf.ndim else np.ones(())
             if name == "dt":
                 direction = direction * 1e-2
-            slope = float((gradient[part][name] * direction).sum())
-            moved = lambda h: {**args, part: {**leaves, name: value + h * direction}}  # noqa: B023
+            directions.setdefault(part, {})[name] = direction
+            slope = slopes[name] = float((gradient[part][name] * direction).sum())
+            moved = lambda h: {**args, part: {**leaves, name: leaf + h * direction}}  # noqa: B023
             central = min(
-                (float(loss(moved(h)) - loss(moved(-h))) / (2 * h) for h in (1e-5, 1e-6)), key=lambda c: abs(c - slope)
+                (float(value(moved(h)) - value(moved(-h))) / (2 * h) for h in (1e-5, 1e-6)),
+                key=lambda c: abs(c - slope),
             )
             worst[name] = abs(central - slope) / max(1.0, abs(slope))
-    contract("leaves", pairs=scene, preset=preset, leaves=sorted(worst), error=max(worst.values()))
+    _, ahead = jax.jit(lambda args, change: jax.jvp(loss, (args,), (change,)))(args, directions)
+    modes = abs(float(ahead) - sum(slopes.values())) / max(1.0, *map(abs, slopes.values()))
+    contract("leaves", pairs=scene, preset=preset, leaves=sorted(worst), error=max(worst.values()), modes=modes)
     assert max(worst.values()) < 2e-6, worst
+    assert modes < 1e-9
+
+    names = []
+    for name, changes in degenerate(scene, state).items():
+        at, gradient = both({**args, "state": {**args["state"], **changes}})
+        bad = [
+            jax.tree_util.keystr(k)
+            for k, g in jax.tree_util.tree_leaves_with_path(gradient)
+            if not np.isfinite(g).all()
+        ]
+        assert np.isfinite(at) and not bad, (name, bad)
+        names.append(name)
+    contract("finite", pairs=scene, preset=preset, where=names)
 
 
-def degenerate(state):
+@pytest.mark.parametrize("scene", SCENES)
+def test_second_derivatives_in_contact(scene, contract):
+    """Hessian-vector product of the pose and the velocities against central differences of the gradient."""
+    model, state, loss = program(scene, "gradient")
+    args = arguments(model, state)
+    start = {name: args["state"][name] for name in ("pos", "vel", "omega")}
+    of_state = lambda moved: loss({**args, "state": {**args["state"], **moved}})
+    rng = np.random.default_rng(1)
+    d = jax.tree.map(lambda c: jnp.asarray(rng.normal(size=c.shape)), start)
+    gradient = jax.grad(of_state)
+    slope = jax.jit(gradient)
+    bend = jax.jit(lambda s: jax.jvp(gradient, (s,), (d,))[1])(start)
+    at = lambda h: slope(jax.tree.map(lambda c, d: c + h * d, start, d))
+    size = max(float(jnp.abs(c).max()) for c in jax.tree.leaves(bend))
+    errors = []
+    for h in (1e-5, 1e-6):
+        curve = jax.tree.map(lambda a, b: (a - b) / (2 * h), at(h), at(-h))
+        errors.append(max(float(jnp.abs(a - b).max()) for a, b in zip(*map(jax.tree.leaves, (curve, bend)))) / size)
+    contract("second", pairs=scene, preset="gradient", error=min(errors))
+    assert min(errors) < 1e-5, errors
+
+
+#: Centres at which the surfaces of a scene just touch.
+TOUCHING = {
+    "sphere-plane, sphere-sphere": [[0, 0, 0.1], [0, 0, 0.3]],
+    "box-plane": [[0, 0, 0.08]],
+    "sphere-box": [[0, 0, 0], [0, 0, 0.18]],
+    "box-box": [[0, 0, 0], [0, 0, 0.15]],
+}
+
+
+def degenerate(scene, state):
     """name -> changes of the state at which a careless derivative is not finite."""
     n = state.n
     turn = lambda *q: jnp.tile(jnp.asarray(q, float), (n, 1))
     still = dict(vel=jnp.zeros((n, 3)), omega=jnp.zeros((n, 3)))
-    touching = jnp.array([[0, 0, 0.1], [0, 0, 0.3]])
+    touching = jnp.array(TOUCHING[scene])
     return {
         "zero velocity, identity attitude": dict(quat=turn(1, 0, 0, 0), **still),
         "distance exactly zero, at rest": dict(pos=touching, quat=turn(1, 0, 0, 0), **still),
@@ -105,23 +174,6 @@ def degenerate(state):
         "coincident centres": dict(pos=jnp.tile(jnp.array([[0.0, 0.0, 0.1]]), (n, 1)), **still),
         "far apart": dict(pos=jnp.arange(3 * n).reshape(n, 3) + jnp.array([0, 0, 5.0])),
     }
-
-
-@pytest.mark.parametrize("scene, preset", EVERY)
-def test_derivatives_are_finite_where_they_degenerate(scene, preset, contract):
-    model, state, _, both = program(scene, preset)
-    args = arguments(model, state)
-    names = []
-    for name, changes in degenerate(state).items():
-        value, gradient = both({**args, "state": {**args["state"], **changes}})
-        bad = [
-            jax.tree_util.keystr(k)
-            for k, g in jax.tree_util.tree_leaves_with_path(gradient)
-            if not np.isfinite(g).all()
-        ]
-        assert np.isfinite(value) and not bad, (name, bad)
-        names.append(name)
-    contract("finite", pairs=scene, preset=preset, where=names)
 
 
 @pytest.mark.parametrize("name", INTEGRATORS)

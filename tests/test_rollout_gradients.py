@@ -331,7 +331,7 @@ def test_a_control_function_of_a_lost_world_spoils_no_parameter():
 
 @pytest.mark.parametrize("solver", ["penalty", "tgs"])
 def test_an_explosion_in_float32_spoils_no_gradient(solver):
-    """A heavy ball on springs that are far too stiff for dt (or shot at the ground): speeds grow until they leave the range."""
+    """A ball on springs far too stiff for dt (or shot at the ground): speeds grow until they leave the range."""
     with jax.enable_x64(False):
         body = rbd.Body("ball", rbd.Sphere(0.1), pos=(0, 0, 0.099), friction=0.5, restitution=0.9)
         scene = rbd.Scene([body], [scenes.ground(friction=0.5)], dt=H)
