@@ -148,9 +148,9 @@ def _roll_truth(i):
     return jnp.stack([x + 0.5 * rolling, speed + rolling])
 
 
-def slider(dt, seconds, method="gradient"):
-    """A mass point with friction: a ball that can hardly be turned. Inputs: speed, friction, force."""
-    body = dataclasses.replace(_ball((0, 0, 0.1), mu=0.5), inertia=(1e9, 1e9, 1e9))
+def slider(dt, seconds, method="gradient", body=None):
+    """A mass point with friction: a ball that can hardly be turned, or ``body``. Inputs: speed, friction, force."""
+    body = body or dataclasses.replace(_ball((0, 0, 0.1), mu=0.5), inertia=(1e9, 1e9, 1e9))
     scene = rbd.Scene([body], [rbd.Geom(rbd.Plane(), friction=0.5)], gravity=(0, 0, -G))
 
     def change(m, s, i):
@@ -274,7 +274,7 @@ CASES = {
         "slide to stop, then stick",
         ("v0", "mu"),
         ("x", "v"),
-        ((2.0, 0.5),),
+        tuple((v, 0.5) for v in np.linspace(1.8, 2.2, 12).tolist()),  # stops at another part of a step
         _slides(1.0, (None, None, 0.0)),
         lambda i: jnp.stack([i[0] ** 2 / (2 * i[1] * G), 0.0 * i[0]]),
         "dx/dv0 = v0 / (mu g), dx/dmu = -v0^2 / (2 mu^2 g)",

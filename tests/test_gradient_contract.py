@@ -74,23 +74,24 @@ def test_second_derivatives_across_an_impact():
 
 def test_a_push_below_the_limit_of_friction_moves_nothing(contract):
     """dx/dF of a held body, relative to that of a sliding one, falls with the speed that regularises friction."""
-    speeds = (1e-4, 1e-5, 1e-6)
+    speeds = (1e-4, 1e-6)
     found = []
+    box = rbd.Body("box", rbd.Box((0.1, 0.1, 0.1)), pos=(0, 0, 0.1), mass=1.0, friction=0.5)
     for speed in speeds:
-        solver = NewtonLagged(iterations=6, polish=3, slip_speed=speed)
-        run = cases.slider(1 / 240, 0.5, dataclasses.replace(rbd.PRESETS["gradient"], solver=solver))
+        solver = dataclasses.replace(rbd.PRESETS["gradient"].solver, slip_speed=speed, slip_compliance=10 * speed)
+        run = cases.slider(1 / 240, 0.5, dataclasses.replace(rbd.PRESETS["gradient"], solver=solver), box)
         slope = jax.jit(jax.jacfwd(lambda F, run=run: run(jnp.stack([0.0 * F, 0.5 + 0.0 * F, F]))[0]))(2.5)
         found.append(float(slope) / 0.125)
     contract(
         "closed",
         event="stick: pushed below the limit of friction",
         derivatives="d(x)/d(F)",
-        formula="0; slip speeds 1e-4, 1e-5, 1e-6 m/s, relative to T^2 / (2 m)",
-        steps=(1 / 240,),
+        formula="0; box, slip speeds 1e-4 and 1e-6 m/s (sigma ten times that), relative to T^2 / (2 m)",
+        steps=(1 / 240, 1 / 240),
         errors=found,
         bar=1e-3,
     )
-    assert 0 <= found[0] <= 1e-3 and found[1] <= 0.2 * found[0] and found[2] <= 0.2 * found[1], found
+    assert 0 < found[0] <= 1e-3 and abs(found[1]) <= 0.1 * found[0], found
 
 
 # --- where there is no derivative ---
@@ -156,7 +157,7 @@ def test_the_order_of_two_impacts_decides_what_follows(contract):
 
 
 def smoothed(how):
-    solver = NewtonLagged(iterations=8, polish=3, smoothing=how)
+    solver = NewtonLagged(iterations=4, polish=8, smoothing=how)
     return dataclasses.replace(rbd.PRESETS["gradient"], solver=solver, events=0)
 
 

@@ -73,7 +73,8 @@ class NewtonLagged(Solver):
       smoothing: None, "forward" (values and derivatives) or "backward" (derivatives only), with the numbers of
         ``Problem.smoothing``.
       tolerance: a world is ``unconverged`` where the residual of a row, as a velocity, exceeds this
-        fraction of the fastest relative velocity (before or wanted) plus slip_speed.
+        fraction of the fastest relative velocity (before or wanted) plus slip_speed. With ``polish``: the root of
+        machine epsilon of their sum.
     """
 
     iterations: int = 3
@@ -257,6 +258,8 @@ class NewtonLagged(Solver):
 
     def _unconverged(self, system: _System, bound, p) -> jax.Array:
         worst, scale = self._violation(system, bound, p)
+        if self.polish:  # implicit derivatives are as wrong as the residual is large
+            return worst > jnp.finfo(worst.dtype).eps ** 0.5 * (scale + self.slip_speed)
         return worst > self.tolerance * scale + self.slip_speed
 
     def _violation(self, system: _System, bounds, ps):

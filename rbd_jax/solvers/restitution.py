@@ -89,4 +89,6 @@ def targets(rows: Rows, problem: Problem) -> Events:
     misses = phi + 0.5 * h * (u0 + end) > 0
     if rows.meets is not None:
         active, misses = active & rows.meets, misses | (~rows.meets & (rows.phi > 0))
-    return Events(active, vhat, jnp.where(active, left, 0.0), a, jnp.where(misses, end, jnp.inf))
+    # below the free velocity by more than rounding, which would decide whether the slot touches
+    slack = jnp.finfo(end.dtype).eps ** 0.5 * (jnp.abs(u0) + jnp.abs(end))
+    return Events(active, vhat, jnp.where(active, left, 0.0), a, jnp.where(misses, end - slack, jnp.inf))
