@@ -31,17 +31,20 @@ def run_tests(report: pathlib.Path, quick: bool) -> int:
     return subprocess.run(call, cwd=ROOT, check=False).returncode
 
 
-def recorded(report: pathlib.Path) -> dict[str, list[dict]]:
-    """Section -> rows, each with the name of its test and whether that passed."""
+def recorded(reports) -> dict[str, list[dict]]:
+    """Section -> rows, each with the name of its test and whether that passed; of a test in several the last report."""
+    tests: dict[str, list[tuple[str, dict]]] = {}
+    for report in reports:
+        for case in ET.parse(report).iter("testcase"):
+            name = f"{case.get('classname')}::{case.get('name')}"
+            passed = not any(case.find(tag) is not None for tag in ("failure", "error"))
+            tests[name] = [
+                (item.get("name"), ast.literal_eval(item.get("value")) | {"test": name, "passed": passed})
+                for item in case.iter("property")
+            ]
     sections: dict[str, list[dict]] = {}
-    for case in ET.parse(report).iter("testcase"):
-        passed = not any(case.find(tag) is not None for tag in ("failure", "error"))
-        for item in case.iter("property"):
-            row = ast.literal_eval(item.get("value"))
-            file = case.get("classname").replace(".", "/") + ".py"
-            sections.setdefault(item.get("name"), []).append(
-                row | {"test": f"{file}::{case.get('name')}", "passed": passed}
-            )
+    for section, row in (pair for rows in tests.values() for pair in rows):
+        sections.setdefault(section, []).append(row)
     return sections
 
 
@@ -143,18 +146,20 @@ Finite in the same programs at: {"; ".join(finite)}. Lost worlds, inactive conta
 
 def main(argv=None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--junit", type=pathlib.Path, help="report of a run with --junitxml, instead of running")
+    parser.add_argument(
+        "--junit", type=pathlib.Path, action="append", help="report of a run with --junitxml, instead of running"
+    )
     parser.add_argument("--out", type=pathlib.Path, default=ROOT / "docs" / "gradients.md")
     parser.add_argument("--quick", action="store_true", help="one case only")
     args = parser.parse_args(argv)
     with tempfile.TemporaryDirectory() as place:
-        report = args.junit or pathlib.Path(place) / "report.xml"
-        status = 0 if args.junit else run_tests(report, args.quick)
-        if not report.exists():
+        reports = args.junit or [pathlib.Path(place) / "report.xml"]
+        status = 0 if args.junit else run_tests(reports[0], args.quick)
+        if not all(report.exists() for report in reports):
             print("pytest wrote no report", file=sys.stderr)
             return status or 1
         args.out.parent.mkdir(parents=True, exist_ok=True)
-        args.out.write_text(page(recorded(report), common.environment()), encoding="utf-8")
+        args.out.write_text(page(recorded(reports), common.environment()), encoding="utf-8")
     print(f"wrote {args.out}")
     return status
 

@@ -54,7 +54,7 @@ def half_angle(t) -> tuple[jax.Array, jax.Array]:
 def exp(t: Vec3, scale=1.0) -> Quat:
     """``scale`` times the quaternion (up to sign) of the rotation vector t [rad]."""
     t2 = t.dot(t)
-    a = jnp.sqrt(t2 + jnp.finfo(t2.dtype).tiny * 1e6)
+    a = jnp.sqrt(jnp.where(t2 > 1.0, t2, 1.0))  # within half a turn |t| is not needed, and has no derivative at zero
     k = 0.25 - (0.25 * _TURN) * jnp.round(a * (1.0 / _TURN)) / a
     n, d = _tangent(t2 * k * k)
     n = n * k
