@@ -32,14 +32,17 @@ def run_tests(report: pathlib.Path, quick: bool) -> int:
 
 
 def recorded(reports) -> dict[str, list[dict]]:
-    """Section -> rows, each with the name of its test and whether that passed; of a test in several the last report."""
+    """Section -> rows, each with whether its test passed; of a test in several reports the last."""
     tests: dict[str, list[tuple[str, dict]]] = {}
     for report in reports:
         for case in ET.parse(report).iter("testcase"):
             name = f"{case.get('classname')}::{case.get('name')}"
             passed = not any(case.find(tag) is not None for tag in ("failure", "error"))
             tests[name] = [
-                (item.get("name"), ast.literal_eval(item.get("value")) | {"test": name, "passed": passed})
+                (
+                    item.get("name"),
+                    ast.literal_eval(item.get("value").replace(": nan", ": 'not finite'")) | {"passed": passed},
+                )
                 for item in case.iter("property")
             ]
     sections: dict[str, list[dict]] = {}
@@ -60,18 +63,19 @@ def closed(rows) -> str:
     lines = []
     for r in rows:
         steps = r["steps"] if len(r["steps"]) == len(r["errors"]) else r["steps"] * len(r["errors"])
-        errors = ", ".join(f"{e:.1e} ({step_text(dt)} s)" for e, dt in zip(r["errors"], steps))
+        errors = ", ".join(f"{number(e)} ({step_text(dt)} s)" for e, dt in zip(r["errors"], steps))
         lines.append([r["event"], r["derivatives"], r["formula"], errors, number(r["bar"]), verdict(r)])
     return common.table(["event", "derivatives", "closed form", "largest error, relative", "bar", "test"], lines)
 
 
 def number(x) -> str:
-    return f"{x:.0e}".replace("e-0", "e-")
+    """An error or a bar, with its digits as they count."""
+    return x if isinstance(x, str) else f"{x:.1e}".replace("e-0", "e-").replace(".0e", "e")
 
 
 def leaves(rows) -> str:
     heads = ["pairs", "preset", "reverse against central differences", "forward against reverse", "test"]
-    lines = [[r["pairs"], f'`"{r["preset"]}"`', f"{r['error']:.1e}", f"{r['modes']:.1e}", verdict(r)] for r in rows]
+    lines = [[r["pairs"], f'`"{r["preset"]}"`', number(r["error"]), number(r["modes"]), verdict(r)] for r in rows]
     return common.table(heads, lines)
 
 
@@ -82,11 +86,11 @@ def page(sections: dict[str, list[dict]], env: dict) -> str:
     finite = sorted(set().union(*(set(r["where"]) for r in get("finite")))) if get("finite") else []
     second = common.table(
         ["pairs", "preset", "Hessian-vector product against differences of the gradient", "test"],
-        [[r["pairs"], f'`"{r["preset"]}"`', f"{r['error']:.1e}", verdict(r)] for r in get("second")],
+        [[r["pairs"], f'`"{r["preset"]}"`', number(r["error"]), verdict(r)] for r in get("second")],
     )
     integrators = common.table(
         ["integrator", "first order", "second order", "test"],
-        [[f'`"{r["integrator"]}"`', f"{r['first']:.1e}", f"{r['second']:.1e}", verdict(r)] for r in get("integrators")],
+        [[f'`"{r["integrator"]}"`', number(r["first"]), number(r["second"]), verdict(r)] for r in get("integrators")],
     )
     none = common.table(
         ["where", "why", "what is returned there, and what was found", "test"],
