@@ -117,6 +117,11 @@ def number(x, digits=3) -> str:
     return f"{x:.{digits}g}" if np.isfinite(x) else "not finite"
 
 
+def step_text(dt: float) -> str:
+    """A step in words: "0.2 ms" or "1/240 s"."""
+    return f"{1e3 * dt:g} ms" if abs(1e6 * dt - round(1e6 * dt)) < 1e-6 else f"1/{1 / dt:.0f} s"
+
+
 def verdict(value, bar, least=False) -> str:
     """Empty without a bar, else "ok" or "MISS"; a value that is missing or not finite misses."""
     if bar is None:

@@ -1,7 +1,7 @@
 """The gradient contract as a page: runs the tests that check it and writes what they found, docs/gradients.md.
 
-    PYTHONPATH=. python benchmarks/gradient_contract.py                     (a few minutes on 2 cores)
-    PYTHONPATH=. python benchmarks/gradient_contract.py --junit FILE        (from the report of a run there was)
+    PYTHONPATH=. python benchmarks/gradient_contract.py                     (25 minutes on 2 cores)
+    PYTHONPATH=. python benchmarks/gradient_contract.py --junit FILE        (from reports of runs there were)
 
 Nothing in the tables is typed here: a test records a row with the fixture ``contract`` when it has found its figures,
 and a row whose test fails afterwards says so.
@@ -10,7 +10,7 @@ and a row whose test fails afterwards says so.
 from __future__ import annotations
 
 import argparse
-import ast
+import json
 import pathlib
 import subprocess
 import sys
@@ -19,9 +19,13 @@ import xml.etree.ElementTree as ET
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import common  # noqa: E402
+from common import number, step_text  # noqa: E402
 
 ROOT = pathlib.Path(__file__).parent.parent
 TESTS = ("tests/test_gradient_contract.py", "tests/test_gradients.py", "tests/test_large_worlds.py")
+
+#: What a page of several reports says of itself.
+LATER = ", of a test the last; the machine and the commit above are those of the page, not of every row"
 
 
 def run_tests(report: pathlib.Path, quick: bool) -> int:
@@ -39,20 +43,12 @@ def recorded(reports) -> dict[str, list[dict]]:
             name = f"{case.get('classname')}::{case.get('name')}"
             passed = not any(case.find(tag) is not None for tag in ("failure", "error"))
             tests[name] = [
-                (
-                    item.get("name"),
-                    ast.literal_eval(item.get("value").replace(": nan", ": 'not finite'")) | {"passed": passed},
-                )
-                for item in case.iter("property")
+                (item.get("name"), json.loads(item.get("value")) | {"passed": passed}) for item in case.iter("property")
             ]
     sections: dict[str, list[dict]] = {}
     for section, row in (pair for rows in tests.values() for pair in rows):
         sections.setdefault(section, []).append(row)
     return sections
-
-
-def step_text(dt: float) -> str:
-    return f"1/{round(1 / dt)}"
 
 
 def verdict(row: dict) -> str:
@@ -62,45 +58,43 @@ def verdict(row: dict) -> str:
 def closed(rows) -> str:
     lines = []
     for r in rows:
-        steps = r["steps"] if len(r["steps"]) == len(r["errors"]) else r["steps"] * len(r["errors"])
-        errors = ", ".join(f"{number(e)} ({step_text(dt)} s)" for e, dt in zip(r["errors"], steps))
-        lines.append([r["event"], r["derivatives"], r["formula"], errors, number(r["bar"]), verdict(r)])
+        errors = ", ".join(f"{number(e, 2)} ({step_text(dt)})" for e, dt in zip(r["errors"], r["steps"]))
+        lines.append([r["event"], r["derivatives"], r["formula"], errors, number(r["bar"], 2), verdict(r)])
     return common.table(["event", "derivatives", "closed form", "largest error, relative", "bar", "test"], lines)
-
-
-def number(x) -> str:
-    """An error or a bar, with its digits as they count."""
-    return x if isinstance(x, str) else f"{x:.1e}".replace("e-0", "e-").replace(".0e", "e")
 
 
 def leaves(rows) -> str:
     heads = ["pairs", "preset", "reverse against central differences", "forward against reverse", "test"]
-    lines = [[r["pairs"], f'`"{r["preset"]}"`', number(r["error"]), number(r["modes"]), verdict(r)] for r in rows]
+    lines = [[r["pairs"], f'`"{r["preset"]}"`', number(r["error"], 2), number(r["modes"], 2), verdict(r)] for r in rows]
     return common.table(heads, lines)
 
 
-def page(sections: dict[str, list[dict]], env: dict) -> str:
+def page(sections: dict[str, list[dict]], env: dict, reports: int) -> str:
     get = lambda name: sections.get(name, [])
     of_leaves = get("leaves")
-    every = sorted(set().union(*(set(r["leaves"]) for r in of_leaves))) if of_leaves else []
-    finite = sorted(set().union(*(set(r["where"]) for r in get("finite")))) if get("finite") else []
+    every = sorted({leaf for r in of_leaves for leaf in r["leaves"]})
+    finite = sorted({place for r in get("finite") for place in r["where"]})
     second = common.table(
         ["pairs", "preset", "Hessian-vector product against differences of the gradient", "test"],
-        [[r["pairs"], f'`"{r["preset"]}"`', number(r["error"]), verdict(r)] for r in get("second")],
+        [[r["pairs"], f'`"{r["preset"]}"`', number(r["error"], 2), verdict(r)] for r in get("second")],
     )
     integrators = common.table(
         ["integrator", "first order", "second order", "test"],
-        [[f'`"{r["integrator"]}"`', number(r["first"]), number(r["second"]), verdict(r)] for r in get("integrators")],
+        [
+            [f'`"{r["integrator"]}"`', number(r["first"], 2), number(r["second"], 2), verdict(r)]
+            for r in get("integrators")
+        ],
     )
     none = common.table(
         ["where", "why", "what is returned there, and what was found", "test"],
         [[r["event"], r["why"], r["found"], verdict(r)] for r in get("none")],
     )
+    source = f"{reports} report(s) of " + ", ".join(f"`{t}`" for t in TESTS) + (LATER if reports > 1 else "")
     return f"""# The gradient contract
 
 What `jax.grad`, `jax.jvp` and `jax.hessian` of `rbd.step` and `rbd.rollout` return, as the tests found it. Float64.
 {common.header(env)}
-Made by `benchmarks/gradient_contract.py` from `{"`, `".join(TESTS)}`.
+Made by `benchmarks/gradient_contract.py` from {source}.
 
 Two promises:
 
@@ -163,7 +157,7 @@ def main(argv=None) -> int:
             print("pytest wrote no report", file=sys.stderr)
             return status or 1
         args.out.parent.mkdir(parents=True, exist_ok=True)
-        args.out.write_text(page(recorded(reports), common.environment()), encoding="utf-8")
+        args.out.write_text(page(recorded(reports), common.environment(), len(reports)), encoding="utf-8")
     print(f"wrote {args.out}")
     return status
 

@@ -36,7 +36,7 @@ import numpy as np
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import common  # noqa: E402
-from common import G, MuJoCo, Program, number  # noqa: E402
+from common import G, MuJoCo, Program, number, step_text  # noqa: E402
 
 import rbd_jax as rbd  # noqa: E402
 from rbd_jax.method import find  # noqa: E402
@@ -529,14 +529,9 @@ def box_scene() -> rbd.Scene:
     return rbd.Scene(bodies=[box], static=[rbd.Geom(rbd.Plane(), friction=0.5)], dt=COST_STEP)
 
 
-def stack_scene() -> rbd.Scene:
-    boxes = [rbd.Body(f"box{i}", rbd.Box((0.1,) * 3), pos=(0, 0, 0.1 + 0.201 * i), friction=0.6) for i in range(5)]
+def stack_scene(count: int = 5) -> rbd.Scene:
+    boxes = [rbd.Body(f"box{i}", rbd.Box((0.1,) * 3), pos=(0, 0, 0.1 + 0.201 * i), friction=0.6) for i in range(count)]
     return rbd.Scene(bodies=boxes, static=[rbd.Geom(rbd.Plane(), friction=0.6)], dt=COST_STEP)
-
-
-def ten_boxes_scene() -> rbd.Scene:
-    boxes = [rbd.Body(f"box{i}", rbd.Box((0.1,) * 3), pos=(0, 0, 0.1 + 0.2 * i), friction=0.5) for i in range(10)]
-    return rbd.Scene(bodies=boxes, static=[rbd.Geom(rbd.Plane(), friction=0.5)], dt=COST_STEP)
 
 
 def ten_scene() -> rbd.Scene:
@@ -554,7 +549,7 @@ COST_SCENES = {
     "ball": ("one ball", ball_scene),
     "box": ("box on a plane", box_scene),
     "stack": ("five-box stack", stack_scene),
-    "boxes": ("ten boxes", ten_boxes_scene),
+    "boxes": ("ten-box stack", functools.partial(stack_scene, 10)),
     "ten": ("five boxes, five balls", ten_scene),
 }
 #: (scene, steps, worlds, blocks of ``checkpoint``)
@@ -684,11 +679,6 @@ ROWS: dict[str, Callable[[bool], Iterator[dict]]] = {"toss": toss, "bounce": bou
 
 
 # --- the page --------------------------------------------------------------------------------------
-
-
-def step_text(dt: float) -> str:
-    """A step in words: "0.2 ms" or "1/240 s"."""
-    return f"{1e3 * dt:g} ms" if abs(1e6 * dt - round(1e6 * dt)) < 1e-6 else f"1/{1 / dt:.0f} s"
 
 
 def toss_page(rows: list[dict], misses: list[str]) -> str:

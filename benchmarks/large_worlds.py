@@ -1,6 +1,6 @@
 """One world with many bodies: does the cost follow the live contacts, and is the answer still right?
 
-    PYTHONPATH=. python benchmarks/large_worlds.py                     (about ten minutes on 2 cores)
+    PYTHONPATH=. python benchmarks/large_worlds.py                     (more than ten minutes on 2 cores)
     PYTHONPATH=. python benchmarks/large_worlds.py --quick --out /tmp/x
 
 Blocks of touching spheres (n x n x n, each pushed at random) and boxes on pedestals (n x n), preset "fast", float32,

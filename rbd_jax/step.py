@@ -96,11 +96,11 @@ def unfit(model: Model, state: State) -> jax.Array:
     """
     s, memory, axes = model.structure, state.memory, len(state.batch_shape)
     over = lambda c, first: c.sum(axis=tuple(range(first, c.ndim)))
-    each = lambda tree: jax.tree.leaves(tree)
-    size = over(sum(c * c for c in each((state.x, state.v, *((state.q, state.w) if s.attitude else ())))), axes)
+    moving = (state.x, state.v, *((state.q, state.w) if s.attitude else ()))
+    size = over(sum(c * c for c in jax.tree.leaves(moving)), axes)
     for tree in (state.kinematic, memory.R, *memory.contacts):  # leaves of one shape: a single sum for each
         if tree is not None:
-            size = size + over(sum(c * 0 for c in each(tree)), axes)
+            size = size + over(sum(c * 0 for c in jax.tree.leaves(tree)), axes)
     bad = ~(size <= limit(size.dtype) ** 2)
     shared = []
     for name in ("inertia", *BASE_NDIM):

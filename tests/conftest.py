@@ -1,5 +1,6 @@
 """Shared settings: every test runs on the CPU backend; compiled programs are shared per session."""
 
+import json
 import os
 
 import pytest
@@ -12,4 +13,4 @@ os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_backend_opti
 @pytest.fixture
 def contract(record_property):
     """Record a row of the gradient contract; ``--junitxml FILE`` has them."""
-    return lambda section, **row: record_property(section, row)
+    return lambda section, **row: record_property(section, json.dumps(row))

@@ -128,17 +128,6 @@ def _two_truth(i, seconds=0.3):
     return jnp.concatenate([x, vb])
 
 
-def _roller(dt):
-    """A ball on a plane. Inputs: speed, friction, force."""
-    scene = rbd.Scene([_ball((0, 0, 0.1), mu=0.3)], [rbd.Geom(rbd.Plane(), friction=0.3)])
-
-    def change(m, s, i):
-        wrench = rbd.Wrench(_along(0, i[2]))
-        return m.replace(friction=i[1] * jnp.ones_like(m.friction)), s.replace(vel=_along(0, i[0])), wrench
-
-    return rollout(scene, dt, 1.0, change, lambda f: (f.pos[0, 0], f.vel[0, 0]))
-
-
 def _roll_truth(i):
     v, mu, F = i
     t = 2 * v / (7 * mu * G)
@@ -160,11 +149,11 @@ def slider(dt, seconds, method="gradient", body=None):
     return rollout(scene, dt, seconds, change, lambda f: (f.pos[0, 0], f.vel[0, 0]), method)
 
 
-def _slides(seconds, given):
+def _slides(seconds, given, body=None):
     """``slider`` with some of its inputs given, as (dt) -> function of the others."""
 
     def at(dt):
-        run = slider(dt, seconds)
+        run = slider(dt, seconds, body=body)
 
         def f(i):
             free = iter(i)
@@ -239,7 +228,7 @@ CASES = {
         ("v0", "mu"),
         ("x", "v"),
         ((2.0, 0.3),),
-        lambda dt: lambda i, f=_roller(dt): f(jnp.concatenate([i, jnp.zeros(1)])),
+        _slides(1.0, (None, None, 0.0), _ball((0, 0, 0.1), mu=0.3)),
         lambda i: _roll_truth(jnp.concatenate([i, jnp.zeros(1)])),
         "dv/dv0 = 5/7, dv/dmu = 0, dx/dmu = -2 v0^2 / (49 mu^2 g)",
         5e-3,
@@ -251,7 +240,7 @@ CASES = {
         ("F",),
         ("x", "v"),
         ((0.5,),),
-        lambda dt: lambda i, f=_roller(dt): f(jnp.concatenate([jnp.array([0.0, 0.3]), i])),
+        _slides(1.0, (0.0, 0.3, None), _ball((0, 0, 0.1), mu=0.3)),
         lambda i: jnp.stack([5 / 14 * i[0], 5 / 7 * i[0]]),
         "dx/dF = 5 T^2 / (14 m)",
         5e-3,

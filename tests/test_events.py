@@ -127,6 +127,16 @@ def test_without_impacts_a_step_is_the_step_without_events():
         np.testing.assert_allclose(a, b, atol=1e-9)
 
 
+def test_a_slot_that_misses_does_not_touch_for_a_rounding_error():
+    """A ball that overlaps the ground and leaves it: whether it is in contact decides where it ends."""
+    body = rbd.Body("ball", rbd.Sphere(0.1), pos=(0, 0, 0.0998), vel=(0, 0, 0.06), restitution=0.3)
+    model, state = rbd.build(rbd.Scene([body], [rbd.Plane()], dt=1 / 120), method="gradient")
+    gravity = model.gravity + 1e-9 * np.random.default_rng(0).normal(size=(64, 3))
+    final, _ = rbd.rollout(model.replace(gravity=gravity), state, 1)
+    assert (np.asarray(final.memory.contacts[0].n) == 0).all()
+    np.testing.assert_allclose(final.pos, np.broadcast_to(final.pos[:1], final.pos.shape), atol=1e-12)
+
+
 @pytest.mark.parametrize("value", [-1, 1.5, True])
 def test_wrong_numbers_of_events_are_refused(value):
     with pytest.raises(ValueError, match="events"):

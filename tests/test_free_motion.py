@@ -330,6 +330,14 @@ def test_rotation_maps(dtype, bound):
     np.testing.assert_allclose(pack(maps.exp(unit * jnp.asarray(0.0, dtype))), [1, 0, 0, 0])
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_turn_by_nothing_has_its_second_derivative(dtype):
+    """exp(t) = (1 - t.t / 8, t / 2) to second order."""
+    bend = jax.hessian(lambda t: jnp.stack(jax.tree.leaves(maps.exp(Vec3(*t)))))(jnp.zeros(3, dtype))
+    np.testing.assert_allclose(bend[0], -0.25 * np.eye(3), atol=1e-6)
+    np.testing.assert_array_equal(bend[1:], 0.0)
+
+
 def test_matrix_to_quat_and_polar():
     rng = np.random.default_rng(0)
     q = rng.normal(size=(200, 4))

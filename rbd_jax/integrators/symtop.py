@@ -61,6 +61,7 @@ def _in_line(q, p, a, b, schedule):
 
 
 def _in_loop(q, p, a, b, schedule):
+    """The same as pairs (B, A) of a loop; the last A turns by nothing, as a schedule ends with B."""
     pairs = jnp.asarray((*schedule, 0.0), q.w.dtype).reshape(-1, 2)
 
     def pair(carry, fractions):
