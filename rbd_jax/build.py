@@ -16,13 +16,15 @@ from .method import SMOOTHING, Method, find
 from .model import Choice, Group, Model, Structure
 from .scene import Scene, resolve, rotation
 from .shapes import SHAPES
-from .solvers.gauss_seidel import UNROLL
+from .solvers.gauss_seidel import loops
 from .solvers.mujoco_law import MujocoLaw
 from .spatial import Quat, Vec3
 from .state import Kinematic, State
 
 #: Groups with more pairs than this choose their pairs at run time (a box pair costs far more than a ball pair).
 DENSE_PAIRS = {("box", "box"): 100, ("sphere", "box"): 600, ("sphere", "sphere"): 2100}
+#: The same for a solver that would go through their colours one by one.
+COLOURED_PAIRS = 500
 #: From this many places on (geoms of side A times geoms of side B) the pairs are searched on a grid, if that has less.
 GRID_PAIRS = 8_000_000
 RANK = {shape.kind: i for i, shape in enumerate(SHAPES)}
@@ -279,15 +281,19 @@ def _groups(r, kinds, category, centred, method: Method, scene: Scene, dt: float
         ga, gb = a[rows], b[rows]
         body_a, body_b = r.geom_body[ga], r.geom_body[gb]
         capacity = choice = None
-        if len(rows) > DENSE_PAIRS.get(kind, 10**9):
+        limit = DENSE_PAIRS.get(kind, 10**9)
+        if method.solver.coloured and kind in DENSE_PAIRS:
+            limit = min(limit, COLOURED_PAIRS)
+        if len(rows) > limit:
             choice = _choice(r, kind, a, b, rows, override, sizes, method)
             capacity = _capacity(r, kind, (a[rows], b[rows]), sizes, category, method, scene, dt)
         if k[2] == "dynamic":
             ends = np.stack([body_a, body_b], 1)
         else:
             ends = (body_a if k[3] else body_b)[:, None]
-        order, colours = _colour(ends) if capacity is None else (np.arange(len(rows)), ())
-        order, colours, padding = _padded(order, colours, NARROW[kind].slots)
+        order, colours, padding = np.arange(len(rows)), (), None
+        if capacity is None and method.solver.coloured:
+            order, colours, padding = _padded(*_colour(ends), NARROW[kind].slots)
         groups.append(
             Group(
                 kind,
@@ -450,7 +456,7 @@ def _colour(ends: np.ndarray) -> tuple[np.ndarray, tuple[tuple[int, int], ...]]:
 
 def _padded(order: np.ndarray, colours, slots: int):
     """Colours of one width for groups that loop over them: short ones repeat a pair, marked as padding (dead)."""
-    if slots <= UNROLL or len({e - s for s, e in colours}) <= 1:
+    if not loops(slots, len(colours)) or len({e - s for s, e in colours}) <= 1:
         return order, colours, None
     width = max(e - s for s, e in colours)
     rows, dead = [], []

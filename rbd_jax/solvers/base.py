@@ -96,6 +96,8 @@ class Solver:
     spins: ClassVar[bool] = False
     #: whether the friction rows of a point share one elliptic cone; else sliding, torsion and rolling have one each
     elliptic: ClassVar[bool] = False
+    #: whether it goes through the rows colour by colour
+    coloured: ClassVar[bool] = False
     #: "velocity": solves for end-of-step velocities; "force": gives forces at the given state
     level: ClassVar[str] = "velocity"
     #: None, or what of contact is smoothed ("forward": all of it, "backward": its derivatives)

@@ -26,6 +26,7 @@ class PGS(Solver):
     name = "pgs"
     contact = "baumgarte"
     spins = True
+    coloured = True
 
     def __post_init__(self):
         if self.sweeps < 1:

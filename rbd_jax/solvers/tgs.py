@@ -38,6 +38,7 @@ class TGS(Solver):
     contact = "soft"
     substeps = True
     spins = True
+    coloured = True
 
     def __post_init__(self):
         if self.sweeps < 1 or self.relax < 1:
