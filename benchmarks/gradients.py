@@ -555,7 +555,7 @@ COST_SCENES = {
 #: (scene, steps, worlds, blocks of ``checkpoint``)
 COST_CASES = [
     *((s, 100, b, (None, 10)) for s in ("ball", "box") for b in (1, 64)),
-    *((s, steps, 1, ((100, 10),)) for s in ("ball", "box") for steps in (1000, 10000)),
+    *((s, steps, 1, (32, 100, (100, 10))) for s in ("ball", "box") for steps in (1000, 10000)),
     ("stack", 100, 1, (None, 10)),
     ("stack", 100, 64, (10,)),
     ("boxes", 100, 1, (None,)),

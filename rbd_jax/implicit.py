@@ -7,7 +7,7 @@ forward mode, and a one-step form alone, whose second derivatives are wrong, is 
 
 Where JAX splits a loop for reverse mode it takes the functions in what is known without their rules. So the last
 step of the iteration is one whose own derivative is right to first order (the one-step form), which makes
-second derivatives right there as well.
+second derivatives right there as well, to the accuracy of the iterate before it.
 
 Source: implicit function theorem; Blondel et al. 2022, "Efficient and modular implicit differentiation"; Bolte,
 Pauwels, Vaiter 2023, "One-step differentiation of iterative algorithms".
@@ -27,7 +27,7 @@ def root(solve, residual, correction, steps: int = 1, better=None):
       solve: theta -> p to within ``steps`` Newton steps, any program; it is not differentiated.
       residual: (p, theta) -> r, a tree like p.
       correction: (p, theta, r) -> dp, linear in r: solves (d residual / d p) dp = -r. The last steps are such.
-      better: (new, old, theta) -> whether to take those steps, or None: always.
+      better: (new, old, theta) -> whether to take those steps, judged before the last one, or None: always.
       All may close over static values only.
     """
 
@@ -36,15 +36,20 @@ def root(solve, residual, correction, steps: int = 1, better=None):
         fixed = jax.lax.stop_gradient(theta)
         old = jax.lax.stop_gradient(solve(fixed))
 
-        def step(p, _):
-            p = jax.lax.stop_gradient(p)
-            return jax.tree.map(lambda p, d: p + d, p, correction(p, fixed, residual(p, theta))), None
+        def step(p, k):
+            p, last = jax.lax.stop_gradient(p), k == steps - 1
+            take = True
+            if better is not None:
+                take = jax.lax.cond(last, lambda: better(p, old, fixed), lambda: every)
+                p = jax.tree.map(lambda p, q: jnp.where(take, p, q), p, old)
+            d = correction(p, fixed, residual(p, theta))
+            # an iterate that is kept has the derivative of a step too
+            none = lambda d: jnp.where(jnp.isfinite(d), d - jax.lax.stop_gradient(d), 0.0)
+            return jax.tree.map(lambda p, d: p + jnp.where(take, d, none(d)), p, d), None
 
-        new = step(old, None)[0] if steps == 1 else jax.lax.scan(step, old, length=steps)[0]
-        if better is None:
-            return new
-        take = better(*jax.lax.stop_gradient((new, old)), fixed)
-        return jax.tree.map(lambda p, q: jnp.where(take, p, q), new, old)
+        if better is not None:
+            every = jnp.ones(jax.eval_shape(better, old, old, fixed).shape, bool)
+        return jax.lax.scan(step, old, jnp.arange(steps))[0]
 
     def rule(primals, tangents):
         (theta,), (change,) = primals, tangents

@@ -121,7 +121,7 @@ MAX_SUBSTEPS = 1000
 PRESETS = {
     "fast": Method("symtop2", None, None),
     "accurate": Method("symtop4", "near_rigid", NewtonLagged(iterations=8)),
-    "gradient": Method("symtop2", "near_rigid", NewtonLagged(iterations=4, polish=8), events=2),
+    "gradient": Method("symtop2", "near_rigid", NewtonLagged(iterations=4, polish=9), events=2),
     "mujoco": Method("scene", "mujoco", "mujoco"),
 }
 
