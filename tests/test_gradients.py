@@ -194,6 +194,54 @@ def degenerate(scene, state):
     }
 
 
+def told(model, state, force):
+    """A number of every public function of a model and a state, (...); ``rollout`` has tests of its own."""
+    after, account = rbd.audit(model, state, rbd.wrench_at(force, state.pos + jnp.array([0.0, 0.02, 0.05]), state.pos))
+    seen = rbd.contacts(model, after)
+    over = lambda c: c.reshape((*state.batch_shape, -1)).sum(-1)
+    return {
+        "step": over(after.pos) + over(after.vel) + over(after.omega),
+        "energy": sum(rbd.energy(model, after)),
+        "momentum": sum(map(over, rbd.momentum(model, after))),
+        "inertia_world": over(rbd.inertia_world(model, after) * jnp.arange(9.0).reshape(3, 3)),
+        "contacts": over(seen.distance) + over(seen.force) + over(seen.point) + over(seen.normal),
+        "audit": account.kinetic + account.work + account.dissipated + account.penetration,
+    }
+
+
+def test_every_public_function_in_float32_and_64_batched_and_not():
+    """Reverse against forward mode and central differences in float64; a batch in float32 against that."""
+    scene = rbd.Scene([box("a", (0, 0, 0.0793), quat=TILT, **MOVING)], [rbd.Geom(rbd.Plane(), friction=0.6)], dt=DT)
+    start = np.array([(0, 0, 0.0793), MOVING["vel"], MOVING["omega"], (1.0, -0.5, 0.3)])
+
+    def function():
+        model, state = rbd.build(scene, method="fast")
+
+        def f(i):
+            rows = lambda k: i[..., k : k + 1, :]
+            s = rbd.batch(state, *i.shape[:-2]) if i.ndim > 2 else state
+            return told(model, s.replace(pos=rows(0), vel=rows(1), omega=rows(2)), rows(3))
+
+        return f
+
+    f = function()
+    d, h = np.random.default_rng(0).normal(size=start.shape), 1e-6
+    reverse, value = jax.jit(jax.jacrev(f))(start), jax.jit(f)
+    _, forward = jax.jit(lambda i: jax.jvp(f, (i,), (d,)))(start)
+    high, low = value(start + h * d), value(start - h * d)
+    with jax.enable_x64(False):
+        starts = jnp.asarray(np.stack([start, 1.1 * start]), jnp.float32)
+        batched = jax.jit(jax.jacrev(function()))(starts)
+    for name, slope in reverse.items():
+        size = float(jnp.abs(slope).max())
+        assert size > 0, name
+        along = float((slope * d).sum())
+        np.testing.assert_allclose(forward[name], along, atol=1e-10 * size, err_msg=name)
+        np.testing.assert_allclose((high[name] - low[name]) / (2 * h), along, atol=1e-6 * size, err_msg=name)
+        np.testing.assert_allclose(batched[name][0, 0], slope, atol=2e-3 * size, err_msg=name)
+        assert not batched[name][0, 1].any(), f"{name}: a world has no influence on another"
+
+
 @pytest.mark.parametrize("name", INTEGRATORS)
 def test_every_integrator(name, contract):
     """Free flight of a tumbling box: gradient and Hessian-vector product in velocity, spin and inertia."""
