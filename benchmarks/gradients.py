@@ -544,22 +544,31 @@ def ten_scene() -> rbd.Scene:
     return rbd.Scene(bodies=bodies, static=[rbd.Geom(rbd.Plane(), friction=0.6)], dt=COST_STEP)
 
 
+def balls_scene() -> rbd.Scene:
+    """Ten balls in two layers, falling a little."""
+    place = lambda i: (0.25 * (i % 5) + 0.03 * (i // 5), 0.02 * i, 0.105 + 0.22 * (i // 5))
+    bodies = [rbd.Body(f"ball{i}", rbd.Sphere(0.1), pos=place(i), friction=0.6) for i in range(10)]
+    return rbd.Scene(bodies=bodies, static=[rbd.Geom(rbd.Plane(), friction=0.6)], dt=COST_STEP)
+
+
 #: name: (title, scene)
 COST_SCENES = {
     "ball": ("one ball", ball_scene),
     "box": ("box on a plane", box_scene),
     "stack": ("five-box stack", stack_scene),
     "boxes": ("ten-box stack", functools.partial(stack_scene, 10)),
+    "balls": ("ten balls", balls_scene),
     "ten": ("five boxes, five balls", ten_scene),
 }
+#: Those that the bar of compilation is for.
+TEN_BODIES = ("boxes", "balls", "ten")
 #: (scene, steps, worlds, blocks of ``checkpoint``)
 COST_CASES = [
     *((s, 100, b, (None, 10)) for s in ("ball", "box") for b in (1, 64)),
     *((s, steps, 1, (32, 100, (100, 10))) for s in ("ball", "box") for steps in (1000, 10000)),
     ("stack", 100, 1, (None, 10)),
     ("stack", 100, 64, (10,)),
-    ("boxes", 100, 1, (None,)),
-    ("ten", 100, 1, (None,)),
+    *((s, 100, 1, (None,)) for s in TEN_BODIES),
 ]
 #: A program whose run is expected to take longer [s] is compiled, for its memory, and not timed.
 LONGEST = 60.0
@@ -665,12 +674,15 @@ def mjx_cost(scene: str, steps: int, solver: str, repeats: int) -> dict:
     }  # fmt: skip
 
 
-def cost(quick: bool) -> Iterator[dict]:
+def cost(quick: bool, scenes=tuple(COST_SCENES)) -> Iterator[dict]:
     rates: dict = {}
     repeats = 5 if not quick else 1
     for scene, steps, worlds, blocks in COST_CASES if not quick else [("ball", 20, 2, (None, 10))]:
-        yield from our_cost(scene, steps, worlds, blocks, repeats, rates)
+        if scene in scenes:
+            yield from our_cost(scene, steps, worlds, blocks, repeats, rates)
     for scene in ("ball", "box", "stack") if not quick else ():
+        if scene not in scenes:
+            continue
         for solver in MJX_SOLVERS if scene != "stack" else ("as it comes",):
             yield mjx_cost(scene, 100, solver, repeats)
 
@@ -809,7 +821,7 @@ def cost_page(rows: list[dict], misses: list[str]) -> str:
         if None not in least.values() and least[10000] > MEMORY_BAR * least[1000]:
             growth = number(least[10000] / least[1000])
             misses.append(f"cost: {scene}: memory at 10,000 steps {growth} x that at 1,000, bar {MEMORY_BAR:g}")
-    for scene in ("boxes", "ten"):
+    for scene in TEN_BODIES:
         ten = [r["compile_s"] for r in ours if r["scene"] == scene]
         if ten and min(ten) > COMPILE_BAR:
             misses.append(f"cost: {COST_SCENES[scene][0]} compile in {number(min(ten))} s, bar {COMPILE_BAR:g}")
@@ -983,6 +995,7 @@ def told(row: dict) -> str:
 def main(argv=None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--rows", default="", metavar="A,B", help=f"default all: {','.join(ROWS)}")
+    parser.add_argument("--scenes", default="", metavar="A,B", help=f"of cost: {','.join(COST_SCENES)}; default all")
     parser.add_argument("--quick", action="store_true", help="a case or two of each, a few steps; nothing is judged")
     parser.add_argument("--report", action="store_true", help="run nothing, write the page and the charts")
     parser.add_argument("--budget", type=float, default=5400.0, help="no further case is begun after so many seconds")
@@ -992,11 +1005,16 @@ def main(argv=None) -> int:
     for key in keys:
         if key not in ROWS:
             parser.error(f"unknown row '{key}'; rows: {', '.join(ROWS)}")
+    scenes = [s for s in args.scenes.split(",") if s] or list(COST_SCENES)
+    for scene in scenes:
+        if scene not in COST_SCENES:
+            parser.error(f"unknown scene '{scene}'; scenes: {', '.join(COST_SCENES)}")
+    rows = ROWS | {"cost": functools.partial(cost, scenes=scenes)}
     begin, out = time.perf_counter(), args.out or common.RESULTS
     env, lines = environment(), out / "gradients.jsonl"
     print(common.header(env), flush=True)
     for key in keys if not args.report else ():
-        for row in ROWS[key](args.quick):
+        for row in rows[key](args.quick):
             row = common.plain(row | {"quick": args.quick, "environment": env})
             common.append_lines(lines, [row])
             print(f"{told(row)}  ({time.perf_counter() - begin:.0f} s)", flush=True)
