@@ -1,19 +1,21 @@
 """World-steps per second beside ``mujoco.rollout``, compile time, and the error at that speed.
 
-    PYTHONPATH=. python benchmarks/throughput.py                 (about 6 minutes on 2 cores)
+    PYTHONPATH=. python benchmarks/throughput.py                 (about 12 minutes on 2 cores)
     PYTHONPATH=. python benchmarks/throughput.py --smoke --out /tmp/x
-    PYTHONPATH=. python benchmarks/throughput.py --devices 2     (batch sharded over two host devices)
+    PYTHONPATH=. python benchmarks/throughput.py --devices 2     (two host devices instead of two threads)
 
 Appends to throughput.jsonl and writes throughput.md under ``--out`` (benchmarks/results).
 
 Both sides run the same MJCF, the same start states and the same number of steps of 4 ms, one after the
-other in turn. Ours is float32 on XLA's own threads, MuJoCo is float64 on two. MuJoCo stores the state of every
+other in turn. Ours is float32, MuJoCo float64; both use all cores (two threads of MuJoCo, which does not gain by more
+here). MuJoCo stores the state of every
 step (``rollout`` cannot do otherwise), ours the last one; "every step stored" is ours with all of them.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import os
 import pathlib
 import sys
@@ -23,6 +25,7 @@ _parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
 _parser.add_argument("--smoke", action="store_true", help="a few seconds: one scene, few worlds and steps")
 _parser.add_argument("--devices", type=int, default=1, metavar="N", help="host devices to shard the batch over")
 _parser.add_argument("--scenes", default="", metavar="A,B", help="only these scenes")
+_parser.add_argument("--mjx", action="store_true", help="MJX too, where it is installed (ten minutes more)")
 _parser.add_argument("--repeats", type=int, default=5, metavar="N", help="timed runs of each side (default 5)")
 _parser.add_argument("--out", type=pathlib.Path, default=None, metavar="DIR", help="default benchmarks/results")
 if __name__ == "__main__":
@@ -33,6 +36,7 @@ if __name__ == "__main__":
         )
 
 import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
@@ -117,13 +121,63 @@ def _stack(n):
     return scene, worlds
 
 
+def _bin(shapes, width):
+    """Bodies dropped into a bin of four upright planes; the start of the timed run is 1.5 s later, at rest but for
+    rolling."""
+    side = int(np.ceil(len(shapes) ** (1 / 3)))
+    pitch = (width - 0.24) / (side - 1)
+    place = lambda k: (pitch * (k % side - (side - 1) / 2), pitch * (k // side % side - (side - 1) / 2))
+    bodies = [
+        rbd.Body(f"b{k}", shape, pos=(*place(k), 0.15 + 0.26 * (k // side**2)), friction=MU)
+        for k, shape in enumerate(shapes)
+    ]
+    half = width / 2
+    turn = lambda axis, angle: (np.cos(angle / 2), *(np.sin(angle / 2) * np.array(axis, float)))
+    upright = [((-half, 0, 0), (0, 1, 0), 1), ((half, 0, 0), (0, 1, 0), -1), ((0, -half, 0), (1, 0, 0), -1),
+               ((0, half, 0), (1, 0, 0), 1)]  # fmt: skip
+    walls = [
+        rbd.Geom(rbd.Plane(), pos=at, quat=turn(axis, sign * np.pi / 2), friction=MU) for at, axis, sign in upright
+    ]
+    scene = rbd.Scene(bodies, [rbd.Geom(rbd.Plane(), friction=MU), *walls], dt=DT)
+    return scene, functools.cache(lambda: rbd.build(scene, dt=DT, method="fast")[0])
+
+
+def _dropped(shapes, width):
+    scene, model = _bin(shapes, width)
+    n = len(shapes)
+
+    def worlds(state, size, rng):
+        pos = np.asarray(state.pos) + rng.uniform(-0.01, 0.01, (size, n, 3))
+        dropped = common.start(state, pos, rng.normal(size=(size, n, 3)) * 0.1)
+        settled = rbd.rollout(model(), dropped._with(memory=None), 375, every=375)[0]
+        return settled._with(memory=None, step=jnp.zeros_like(settled.step))
+
+    return scene, worlds
+
+
+def pile16():
+    return _dropped([rbd.Sphere(0.1)] * 16, 0.56)
+
+
+def pile64():
+    return _dropped([rbd.Sphere(0.1)] * 64, 0.94)
+
+
+def clutter():
+    shapes = [rbd.Sphere(0.1), rbd.Box((0.12, 0.1, 0.08)), rbd.Sphere(0.08), rbd.Box((0.1, 0.1, 0.1))] * 2
+    return _dropped(shapes, 0.6)
+
+
 #: name: (maker, steps timed, batches of "fast", batch of "accurate", MuJoCo's worlds, bars of ratio and compile [s])
 SCENES = {
-    "ball": (ball, 1000, (1024, 4096, 16384), 1024, 1024, 50.0, 5.0),
-    "isotropic": (isotropic, 1000, (1024, 4096, 16384), 1024, 1024, 50.0, 5.0),
-    "asymmetric": (asymmetric, 1000, (1024, 4096, 16384), 1024, 1024, 15.0, 5.0),
-    "box": (box, 250, (1024, 4096, 16384), 1024, 1024, 5.0, 5.0),
-    "stack": (lambda: _stack(5), 250, (1024,), 128, 128, None, None),
+    "ball": (ball, 1000, (1024, 4096, 16384), 1024, 1024, 200.0, 3.0),
+    "isotropic": (isotropic, 1000, (1024, 4096, 16384), 1024, 1024, 200.0, 3.0),
+    "asymmetric": (asymmetric, 1000, (1024, 4096, 16384), 1024, 1024, 50.0, 3.0),
+    "box": (box, 250, (1024, 4096), 1024, 1024, 15.0, 3.0),
+    "stack": (lambda: _stack(5), 250, (1024,), 128, 128, 3.0, 10.0),
+    "clutter": (clutter, 250, (1024,), None, 128, 3.0, 10.0),
+    "pile16": (pile16, 250, (1024,), None, 128, 4.0, 10.0),
+    "pile64": (pile64, 100, (1024,), None, 64, 2.0, 10.0),
 }
 TITLES = {
     "ball": "ball on a plane",
@@ -131,31 +185,27 @@ TITLES = {
     "asymmetric": "asymmetric free box",
     "box": "box on a plane",
     "stack": "five-box stack",
+    "clutter": "4 boxes and 4 balls in a bin",
+    "pile16": "16 balls in a bin",
+    "pile64": "64 balls in a bin",
     "ten_boxes": "10 boxes (compile only)",
 }
-TEN_BOX_COMPILE = 20.0
+TEN_BOX_COMPILE = 10.0
 OVERHEAD_BAR = 1.5
+MJX_BAR = 50.0  # scenes of five or more bodies; elsewhere faster at all
 
 
 # --- timing ---
 
 
-def last(steps, devices=1):
-    """(model, state) -> the final state, over one device or with the batch sharded."""
-    run = lambda model, state: rbd.rollout(model, state, steps, every=steps)[0]
-    if devices == 1:
-        return run
-    P = jax.sharding.PartitionSpec
-    mesh = jax.make_mesh((devices,), ("worlds",))
-    return jax.shard_map(run, mesh=mesh, in_specs=(P(), P("worlds")), out_specs=P("worlds"), check_vma=False)
+def last(steps):
+    """(model, state) -> the final state."""
+    return lambda model, state: rbd.rollout(model, state, steps, every=steps)[0]
 
 
-def placed(state, devices):
-    if devices == 1:
-        return state
-    mesh = jax.make_mesh((devices,), ("worlds",))
-    sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("worlds"))
-    return jax.device_put(state, sharding)
+def called(model, state, steps):
+    """Run the rollout as a user calls it, on all cores or devices, and wait."""
+    jax.block_until_ready(rbd.rollout(model, state, steps, every=steps)[0])
 
 
 def spread(times) -> dict:
@@ -186,16 +236,17 @@ def measure(name, method, batches, args, env, steps, mj_worlds):
     chunk = rival.tune(initial, steps)
     probes = {}
     for size in batches:
-        state = placed(worlds(one, size, np.random.default_rng(1)), args.devices)
-        program = Program(last(steps, args.devices), model, state)
-        program(model, state)
-        probes[size] = (program, state, min(program.seconds(model, state) for _ in range(2)) / size)
+        state = worlds(one, size, np.random.default_rng(1))
+        program = Program(last(steps), model, state)
+        run = functools.partial(called, model, state, steps)
+        run()
+        probes[size] = (program, state, min(in_turn([run], 2)[0]) / size)
     best = min(probes, key=lambda b: probes[b][2])
     rows, errors = [], None
     for size in sorted({min(batches), best}):
         program, state, _ = probes[size]
         calls = [
-            lambda p=program, s=state: p(model, s),
+            lambda s=state: called(model, s, steps),
             lambda: rival.call(initial, steps, arrays, chunk),
         ]
         ours, theirs = in_turn(calls, args.repeats)
@@ -225,15 +276,14 @@ def measure(name, method, batches, args, env, steps, mj_worlds):
             }
         )  # fmt: skip
     rival.close()
-    if method == "fast" and args.devices == 1 and name != "stack":
+    if method == "fast" and args.devices == 1 and name in ("ball", "isotropic", "asymmetric", "box"):
         rows[0]["ratio_every_step_stored"] = stored(model, probes[min(batches)][1], steps, args.repeats, rows[0])
     return rows
 
 
 def stored(model, state, steps, repeats, row):
     """The ratio when ours, like MuJoCo, stores the state of every step."""
-    program = Program(lambda m, s: rbd.rollout(m, s, steps, every=1), model, state)
-    (times,) = in_turn([lambda: program(model, state)], repeats)
+    (times,) = in_turn([lambda: jax.block_until_ready(rbd.rollout(model, state, steps, every=1))], repeats)
     return len(state.step) * steps / np.median(times) / row["mujoco"]["world_steps_per_s"]
 
 
@@ -267,7 +317,7 @@ def contact_errors(name, rival, program, model, one, size, worlds, args):
 
     "ours" and "mujoco" are the worst of 64 worlds. Distances and speeds are relative to the closed form.
     """
-    state = placed(worlds(one, size, np.random.default_rng(1)), args.devices)
+    state = worlds(one, size, np.random.default_rng(1))
     steps = SCENES[name][1] if not args.smoke else 50
     seconds = 2.0 if not args.smoke else 0.2
     few = min(RUNS_OF_ERROR, size)
@@ -287,12 +337,12 @@ def contact_errors(name, rival, program, model, one, size, worlds, args):
     speed = lambda v: float(np.abs(v.reshape(few, -1, 6)[..., part]).max())
     out["penetration_m"] = {"ours": rival.penetration(ours[0]), "mujoco": rival.penetration(theirs[0])}
     out["residual_speed_m_s"] = {"ours": speed(ours[1]), "mujoco": speed(theirs[1])}
-    if name == "stack":
+    if name not in ("ball", "box"):
         return out
     v0 = np.linspace(1.0, 4.0, size)
     zero, rest = np.zeros((size, 1, 3)), 0.1  # both lie 0.1 m above the plane
     sliding = common.start(one, zero + [0, 0, rest], zero + v0[:, None, None] * [1, 0, 0], zero)
-    p0, ours, theirs, seconds = compare(placed(sliding, args.devices), seconds)
+    p0, ours, theirs, seconds = compare(sliding, seconds)
     u = v0[:few]
     if name == "ball":
         exact = 5 / 7 * u
@@ -330,6 +380,52 @@ def free_errors(name, rival, program, model, one, size, worlds, args):
         },
         "reference_halving_rad": common.angle(*exact).max(),
     }  # fmt: skip
+
+
+# --- MJX, where it is installed ---
+
+#: scene: (batches, steps timed); a scene of several bodies is slow enough that few steps tell.
+MJX = {
+    "ball": ((256, 1024, 4096), 100),
+    "isotropic": ((256, 1024, 4096), 100),
+    "asymmetric": ((256, 1024, 4096), 100),
+    "box": ((64, 256, 1024), 50),
+    "stack": ((16, 64), 5),
+    "clutter": ((16, 64), 5),
+    "pile16": ((8, 32), 5),
+}
+
+
+def mjx_rows(name, args, env):
+    """Rows of MJX on the same scene and start states: its best batch; an error it raises is kept as the reason."""
+    import gradients  # what it needs of MJX is there
+
+    mjx = gradients.mjx_module()
+    same = {**env, "benchmark": "mjx", "scene": name, "dt": DT, "dtype": "float32"}
+    if mjx is None:
+        return [{**same, "reason": gradients.NO_MJX}]
+    scene, worlds = SCENES[name][0]()
+    model, one = rbd.build(scene, dt=DT, method="fast")
+    batches, steps = MJX[name]
+    rows = []
+    for size in batches:
+        qpos, qvel = rbd.to_mujoco(model, worlds(one, size, np.random.default_rng(1)))
+        try:
+            m, d = gradients.mjx_model(scene, DT)
+            run = jax.vmap(lambda q, v, m=m, d=d: gradients.mjx_end(m, d.replace(qpos=q, qvel=v), steps).qpos)
+            begin = time.perf_counter()
+            compiled = jax.jit(run).lower(qpos, qvel).compile()
+            compile_s = time.perf_counter() - begin
+            (times,) = in_turn([lambda: jax.block_until_ready(compiled(qpos, qvel))], 3)
+        except Exception as error:
+            return [*rows, {**same, "batch": size, "reason": f"{type(error).__name__}: {str(error)[:200]}"}]
+        rows.append({**same, "batch": size, "steps": steps, **spread(times), "compile_s": compile_s,
+                     "ns_per_world_step": 1e9 * np.median(times) / size / steps})  # fmt: skip
+        print(
+            f"{name:11s} MJX       {size:6d} {rows[-1]['ns_per_world_step']:9.0f} ns  compile {compile_s:.1f} s",
+            flush=True,
+        )
+    return rows
 
 
 # --- compile time alone ---
@@ -381,7 +477,7 @@ def report(env, rows, extra, seconds):
         )  # fmt: skip
     compiles = []
     for r in rows:
-        if not r.get("best", True) and r["batch"] != LEAST:
+        if r["benchmark"] == "mjx" or (not r.get("best", True) and r["batch"] != LEAST):
             continue
         bar = TEN_BOX_COMPILE if r["scene"] == "ten_boxes" else SCENES[r["scene"]][6]
         bar = bar if r["method"] == "fast" else None
@@ -405,11 +501,33 @@ def report(env, rows, extra, seconds):
         for k, rows_of_scene in extra.items()
         for v in rows_of_scene
     ]
+    rivals = []
+    for name in {r["scene"]: None for r in rows if r["benchmark"] == "mjx"}:
+        mine = min(r["ns_per_world_step"] for r in timed if r["scene"] == name and r["method"] == "fast")
+        theirs = [r for r in rows if r["benchmark"] == "mjx" and r["scene"] == name]
+        done = [r for r in theirs if "ns_per_world_step" in r]
+        bar = MJX_BAR if name in ("stack", "clutter", "pile16") else 1.0
+        if done:
+            top = min(done, key=lambda r: r["ns_per_world_step"])
+            ratio = top["ns_per_world_step"] / mine
+            rivals.append(
+                [TITLES[name], f"{top['batch']:,}", number(top["ns_per_world_step"]), number(top["compile_s"])]
+                + [number(mine), f"**{number(ratio)}**", f"{bar:g}", verdict(ratio, bar, least=True)]
+            )
+        for r in theirs:
+            if "reason" in r:
+                rivals.append([TITLES[name], r.get("batch", "-"), r["reason"], "-", number(mine), "-", "-", "-"])
+    rivals = (
+        "## MJX on the same cores\n\nIts best batch, float32, same MJCF and start states.\n\n"
+        + common.table(["scene", "batch", "MJX [ns]", "compile [s]", "ours [ns]", "ratio", "bar", ""], rivals)
+        if rivals
+        else ""
+    )
     return f"""# Throughput
 
 {common.header(env)}
-Made by `benchmarks/throughput.py` in {seconds:.0f} s; dt = 4 ms. Ours: float32, XLA's own threads, batch
-{"on one device" if env["sharded_over"] == 1 else f"sharded over {env['sharded_over']} host devices"}. MuJoCo: float64,
+Made by `benchmarks/throughput.py` in {seconds:.0f} s; dt = 4 ms. Ours: `rbd.rollout` as a user calls it, float32,
+{"a thread a core" if env["sharded_over"] == 1 else f"sharded over {env['sharded_over']} host devices"}. MuJoCo: float64,
 `mujoco.rollout` with 2 threads, tuned chunks, arrays allocated before, compiling the model not counted. Both
 measured in turn, synchronised; median of {len(timed[0]["runs_s"]) if timed else 0}. ns per world-step of all cores
 together.
@@ -434,6 +552,8 @@ both; MuJoCo with its default soft contact), residual speed (ball: along the nor
 ## Other forms of the same call, over the time of `rollout` (bar {OVERHEAD_BAR})
 
 {common.table(["scene", "batch", "vmap(rollout)", "scan over step"], ratios)}
+
+{rivals}
 """
 
 
@@ -472,8 +592,12 @@ def main(args) -> int:
         if args.smoke:
             steps, batches, mj_worlds = 50, (64,), 32
         keep(measure(name, "fast", batches, args, env, steps, mj_worlds))
-        if not args.smoke:
+        if not args.smoke and accurate:
             keep(measure(name, "accurate", (accurate,), args, env, steps, mj_worlds))
+        if args.mjx and name in MJX:
+            new = mjx_rows(name, args, env)
+            rows.extend(new)
+            common.append_lines(out / "throughput.jsonl", new)
         if name in ("ball", "box", "stack") and args.devices == 1:
             sizes = {min(batches[0], mj_worlds), *(batches if name != "stack" else ())}
             extra[name] = [overheads(name, args, steps, size) for size in sorted(sizes)]

@@ -11,7 +11,9 @@ from .build import build
 from .contact.sdf import sdf
 from .convert import from_mujoco, to_mujoco
 from .diagnostics import Contacts, SimulationError, check, contacts, energy, inertia_world, momentum, wrench_at
+from .estimate import memory_estimate
 from .horizon import GradientNorms, gradient_norms
+from .memory import MemoryEstimate
 from .method import PRESETS, Method
 from .mjcf import load_mjcf, to_mjcf
 from .model import Model
@@ -19,6 +21,7 @@ from .rollout import rollout, step
 from .scene import Body, Geom, Pair, Scene
 from .shapes import Box, Plane, Sphere
 from .solvers import CONTACT_MODELS, SOLVERS
+from .spread import use_cores
 from .state import State, Wrench, batch
 from .status import Status
 
@@ -32,6 +35,7 @@ __all__ = [
     "Contacts",
     "Geom",
     "GradientNorms",
+    "MemoryEstimate",
     "Method",
     "Model",
     "PRESETS",
@@ -54,11 +58,13 @@ __all__ = [
     "gradient_norms",
     "inertia_world",
     "load_mjcf",
+    "memory_estimate",
     "momentum",
     "rollout",
     "sdf",
     "step",
     "to_mjcf",
     "to_mujoco",
+    "use_cores",
     "wrench_at",
 ]

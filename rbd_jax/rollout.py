@@ -10,13 +10,16 @@ are lost from the start are replaced by harmless ones. Its values are those of t
 from __future__ import annotations
 
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .memory import refuse
 from .model import BASE_NDIM, Model, batch_of
 from .spatial import Vec3
+from .spread import lowered_share, means, over_cores, over_devices
 from .state import State, World, Wrench
 from .step import (
     advance,
@@ -33,6 +36,7 @@ from .step import (
     unfit,
     with_memory,
 )
+from .tiles import tiled
 
 
 def step(model: Model, state: State, control=None) -> State:
@@ -54,7 +58,7 @@ def step(model: Model, state: State, control=None) -> State:
     if callable(control):
         control = control(model, state)
     _check_wrench(model, state, control)
-    return _step(model, with_memory(model, state), control)
+    return _step(model, state, control)
 
 
 def rollout(
@@ -65,6 +69,7 @@ def rollout(
     control=None,
     checkpoint: int | tuple[int, ...] | None = None,
     truncate: int | None = None,
+    donate: bool = False,
 ) -> tuple[State, State]:
     """Advance the worlds by ``steps`` steps in one compiled loop.
 
@@ -84,6 +89,11 @@ def rollout(
         k K takes its state as a constant for k = 1, 2, ... Values are unchanged; the final state depends on
         the model and the control of the last block only, on the initial state only where steps <= K, and a sample on
         what happened since the last cut before it.
+      donate: let the result take the memory of ``state``, which must not be used again.
+
+    A call that is made rather than traced, of many worlds and without a control function, is spread over all local
+    devices of JAX, or over the cores of its only CPU (:func:`rbd_jax.use_cores`); it then waits for the result. What
+    becomes of a world does not depend on that, nor on how many others there are if there are 32 or more.
 
     Returns:
       final: state after all steps.
@@ -99,6 +109,7 @@ def rollout(
 
     Raises:
       ValueError: steps < 0, every < 1, checkpoint or truncate not as above, wrong shapes or batch sizes.
+      MemoryError: the samples cannot fit into what the device has left.
     """
     for name, value, least in (("steps", steps, 0), ("every", every, 1), ("truncate", truncate, 1)):
         if not (name == "truncate" and value is None) and not _whole(value, least):
@@ -106,11 +117,19 @@ def rollout(
     blocks = blocks_of("rollout", checkpoint)
     truncate = None if truncate is None else int(truncate)
     _check_state(model, state)
-    state = with_memory(model, state)
     if callable(control):
         return _rollout_with(model, state, int(steps), int(every), control, blocks, truncate)
     _check_wrench(model, state, control)
-    return _rollout(model, state, control, int(steps), int(every), blocks, truncate)
+    steps, every, batch = int(steps), int(every), batch_of(model, state.batch_shape)
+    worlds = math.prod(batch)
+    use = means((model, state, control), worlds, steps)
+    refuse(state, worlds, steps // every + 1, 1 + (use.cores > 1))
+    if use.devices:
+        return over_devices(_forward(steps, every), use.devices, model, state, control, batch, donate)
+    if use.cores > 1:
+        return over_cores(_forward(steps, every), use.cores, model, state, control, batch)
+    call = _rollout_donated if donate else _rollout
+    return call(model, state, control, steps, every, blocks, truncate)
 
 
 # --- checks, before anything is traced ---
@@ -145,7 +164,8 @@ def _check_state(model: Model, state: State) -> None:
         raise ValueError(
             f"state is {state.x.x.dtype}, the model is {model.mass.dtype}: build both under the same jax_enable_x64"
         )
-    batch_of(model, state.batch_shape)
+    if 0 in batch_of(model, state.batch_shape):
+        raise ValueError(f"batch size 0: the state has batch axes {state.batch_shape}; there is no world to step")
 
 
 def _check_wrench(model: Model, state: State, wrench) -> None:
@@ -429,20 +449,53 @@ def _grow_model(model: Model, batched: Model, size: int) -> Model:
     return model._with(**changes) if changes else model
 
 
+def _in_tiles(core):
+    """``core(model, state, wrench)``, a batch of worlds cut into tiles."""
+    return lambda model, state, wrench: tiled(core, model, state, wrench, batch_of(model, state.batch_shape))
+
+
+@functools.cache
+def _forward(steps: int, every: int):
+    """``core(model, state, wrench)`` of a rollout; one object for every pair of numbers."""
+
+    def core(model, state, wrench):
+        return _rollout_batch(model, with_memory(model, state), wrench, steps, every)
+
+    return core
+
+
 @jax.jit
 def _step(model, state, wrench):
-    return _batched_call(_step_batch, functools.partial(_step_batch, safe=True))(model, state, wrench)
+    call = _batched_call(_in_tiles(_step_batch), functools.partial(_step_batch, safe=True))
+    return call(model, with_memory(model, state), wrench)
 
 
-@functools.partial(jax.jit, static_argnums=(3, 4, 5, 6))
-def _rollout(model, state, wrench, steps, every, blocks, truncate):
-    core = lambda model, state, wrench: _rollout_batch(model, state, wrench, steps, every)
+def _rolled(model, state, wrench, steps, every, blocks, truncate):
+    core = _in_tiles(_forward(steps, every))
     derived = functools.partial(_rollout_batch, steps=steps, every=every, blocks=blocks, truncate=truncate, safe=True)
-    return _batched_call(core, derived)(model, state, wrench)
+    return _batched_call(core, derived)(model, with_memory(model, state), wrench)
+
+
+_rollout = jax.jit(_rolled, static_argnums=(3, 4, 5, 6))
+_rollout_donated = jax.jit(_rolled, static_argnums=(3, 4, 5, 6), donate_argnums=(1,))
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3, 4, 5, 6))
 def _rollout_with(model, state, steps, every, control, blocks, truncate):
+    state = with_memory(model, state)
     ask, closed = asked(model, state, control)
     core = functools.partial(_rollout_batch, steps=steps, every=every, ask=ask)
     return _derived(core, functools.partial(core, blocks=blocks, truncate=truncate, safe=True))(model, state, closed)
+
+
+def program(model: Model, state: State, steps: int, every: int):
+    """The compiled program of ``rollout(model, state, steps, every)``, how many run at once, and what they give.
+
+    model, state: arrays or their shapes.
+    """
+    batch = state.batch_shape
+    core, parts = _forward(steps, every), means(state, math.prod(batch), steps).cores
+    out = jax.eval_shape(core, model, state, None)
+    if parts > 1:
+        return lowered_share(core, model, state, batch, parts).compile(), parts, out
+    return _rollout.lower(model, state, None, steps, every, (), None).compile(), 1, out

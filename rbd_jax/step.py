@@ -27,7 +27,7 @@ from .spatial import Vec3, components, where, zeros_like
 from .state import Memory, State, World, Wrench, to_hot, to_public
 from .status import Status
 from .struct import struct
-from .xla import materialise, opaque_one
+from .xla import materialise, opaque_one, summed
 
 FROZEN = int(Status.NOT_FINITE)
 
@@ -95,7 +95,7 @@ def unfit(model: Model, state: State) -> jax.Array:
     ``state`` is grown and has its memory.
     """
     s, memory, axes = model.structure, state.memory, len(state.batch_shape)
-    over = lambda c, first: c.sum(axis=tuple(range(first, c.ndim)))
+    over = lambda c, first: summed(c.reshape(*c.shape[:first], -1), first)
     moving = (state.x, state.v, *((state.q, state.w) if s.attitude else ()))
     size = over(sum(c * c for c in jax.tree.leaves(moving)), axes)
     for tree in (state.kinematic, memory.R, *memory.contacts):  # leaves of one shape: a single sum for each
@@ -115,7 +115,7 @@ def unfit(model: Model, state: State) -> jax.Array:
             bad = bad | wrong.reshape(*wrong.shape, *(1,) * (axes - own))
         else:
             shared.append(value.ravel())
-    return bad | ((jnp.concatenate(shared) * 0).sum() != 0)
+    return bad | (summed(jnp.concatenate(shared) * 0) != 0)
 
 
 def marked(state: State, lost: jax.Array) -> State:
@@ -395,7 +395,7 @@ def _freeze(old: World, new: World, p: Params) -> tuple[World, jax.Array]:
         moments = p.inertia.moments
         least = moments if p.inertia.isotropic else jnp.minimum(jnp.minimum(moments.x, moments.y), moments.z)
         size = size + bodies.L.dot(bodies.L) * (1.0 / (least * least))
-    size = materialise(size.sum(axis=0), p.one)
+    size = materialise(summed(size), p.one)
     fits = size <= limit(size.dtype) ** 2  # false for NaN
     ok = fits & ((new.status & jnp.uint32(FROZEN)) == 0)
     status = jnp.where(fits, new.status, new.status | jnp.uint32(FROZEN))
@@ -475,7 +475,7 @@ def _to_impacts(model: Model, p: Params, world: World, wrench: Wrench | None):
         if c.warm.t1 is not None:
             t1, t2 = c.rows.tangents
             J = J + t1 * c.warm.t1 + t2 * c.warm.t2
-        slots = lambda v: v.map(lambda c: c.sum(axis=0))
+        slots = lambda v: v.map(summed)
         support = spread(support, c.rows, slots(J))
         if world.bodies.L is not None:
             turn = _spread_sides(
@@ -587,7 +587,7 @@ def _correction(p: Params, problem: Problem, solution: Solution, v0: Vec3, v1: V
     """
     push = zeros_like(v0)
     for rows, lam in zip(problem.rows, solution.contacts):
-        push = spread(push, rows, rows.n * lam.n.sum(axis=0))
+        push = spread(push, rows, rows.n * summed(lam.n))
     if solution.warm:
         push = materialise(push, p.one)
     s = push.dot(push)
@@ -634,7 +634,7 @@ def _impacts(p: Params, problem: Problem, solution: Solution, v1: Vec3) -> _Impa
         if mine.t1 is not None:
             t1, t2 = rows.tangents
             J = J + t1 * mine.t1 + t2 * mine.t2
-        slots = lambda v: v.map(lambda c: c.sum(axis=0))
+        slots = lambda v: v.map(summed)
         impulse = spread(impulse, rows, slots(J))
         late = slots(J * at)
         shift = spread(shift, rows, late * -1.0)
@@ -670,11 +670,11 @@ def _passive(p: Params, problem: Problem, solution: Solution) -> Solution:
             events = targets(rows, problem)
             left, e = (jnp.where(events.active, x, y) for x, y in ((events.left, left), (rows.e, e)))
         b, a = (_power(rows, lam, v_, w_, accel, left) for v_, w_ in ((problem.v, problem.w), (v, w)))
-        slots = lambda c: c.sum(axis=0)
+        slots = summed
         before, after = add_rows(before, rows.b, slots(b)), add_rows(after, rows.b, slots(a))
         most = add_rows(most, rows.b, slots(-e * b))
     if coupled:
-        before, after, most = (c.sum(axis=0, keepdims=True) for c in (before, after, most))
+        before, after, most = (summed(c)[None] for c in (before, after, most))
     gains = after > most
     change = jnp.where(gains, after - before, 1.0)
     theta = jnp.where(gains, jnp.clip((most - before) / jnp.where(change > 0, change, 1.0), 0.0, 1.0), 1.0)

@@ -119,3 +119,11 @@ def test_the_gradient_contract_is_a_page(tmp_path):
     done = run("gradient_contract.py", "--quick", "--out", tmp_path / "gradients.md")
     assert done.returncode == 0, done.stderr[-3000:]
     assert "| free flight |" in (tmp_path / "gradients.md").read_text()
+
+
+@pytest.mark.parametrize("script, page", (("scaling", "slope"), ("rooflines", "Gflop/s"), ("equal_error", "ratio")))
+def test_speed_scripts_write_rows(tmp_path, script, page):
+    smoke(f"{script}.py", tmp_path)
+    assert page in (tmp_path / f"{script}.md").read_text()
+    data = [*tmp_path.glob(f"{script}.json*")]
+    assert data and "versions" in data[0].read_text()

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..spatial import Vec3
 from ..struct import struct
-from ..xla import materialise
+from ..xla import in_one_function, materialise, summed
 from .base import Problem, Solution
 from .colouring import Plan, plan
 from .laws import Law
@@ -50,6 +50,18 @@ class Group:
     events: Events | None
     plan: Plan | None = None
     couples: Couples | None = None
+    points: Points | None = None
+
+
+@struct
+class Points:
+    """The points of a group that are live in any world, in the order of a sweep: pair by pair, slot by slot.
+
+    order: pair * slots + slot of each, int32 (P S,), of which the first ``count`` are valid.
+    """
+
+    order: jax.Array
+    count: jax.Array
 
 
 @struct
@@ -191,7 +203,23 @@ def prepare(rows: Rows, problem: Problem) -> Group:
         events=materialise_events(targets(rows, problem), one) if rows.e is not None else None,
         plan=chunks,
         couples=None if rows.mu_spin is None else _couples(rows, t1, t2, ib, ia),
+        points=_points(rows) if in_one_function() and isinstance(rows.b, Index) else None,
     )
+
+
+def _points(rows: Rows) -> Points:
+    live = rows.live.any(axis=-1).T.ravel()
+
+    def put(carry, x):
+        order, count = carry
+        number, counts = x
+        return (jax.lax.dynamic_update_slice(order, number[None], (count,)), count + counts), None
+
+    total = len(live)
+    # a point is written where the next one goes; the number stays only if it counts
+    start = (jnp.zeros(total, jnp.int32), jnp.int32(0))
+    (order, count), _ = jax.lax.scan(put, start, (jnp.arange(total, dtype=jnp.int32), live.astype(jnp.int32)))
+    return Points(order, count)
 
 
 def _couples(rows: Rows, t1: Vec3, t2: Vec3, ib, ia) -> Couples:
@@ -212,7 +240,7 @@ def apply(g: Group, lam: Impulses, body):
     v, w = body
     rows = g.rows
     # of many pairs of one world XLA's own sum over a slow axis takes 10 times as long as the additions
-    slots = lambda c: c.sum(0) if g.plan is None else sum(c[1:], c[0])
+    slots = lambda c: summed(c) if g.plan is None else sum(c[1:], c[0])
     p = rows.n * lam.n
     if lam.t1 is not None:
         p = p + g.t1 * lam.t1 + g.t2 * lam.t2
@@ -253,7 +281,8 @@ def sweeps(groups, laws, lam, body, one, count: int):
         return (body, tuple(lam)), None
 
     carry = (body, tuple(lam))
-    if count > UNROLL or (count > 1 and any(g.plan is not None for g in groups)):
+    rolled = any(g.plan is not None or g.points is not None for g in groups)
+    if count > UNROLL or (count > 1 and rolled):
         full = lambda l, g: jax.tree.map(lambda c: jnp.broadcast_to(c, g.rows.phi.shape), l)
         carry = (body, tuple(full(l, g) for l, g in zip(lam, groups)))
         return jax.lax.scan(once, carry, length=count)[0]
@@ -273,6 +302,8 @@ def sweep(g: Group, law: Sweep, lam: Impulses, body, one):
     pairs = rows.phi.shape[1]
     if not isinstance(rows.b, Index):
         return _sweep_chunks(g, law, lam, body, one)
+    if g.points is not None:
+        return _sweep_points(g, law, lam, body, one)
     colours = rows.colours or ((0, pairs),)
     whole = len(colours) == 1
     if loops(rows.slots, len(colours)):
@@ -339,6 +370,47 @@ def _sweep_colours(g: Group, law: Sweep, lam: Impulses, body, one):
     return body, lam
 
 
+def _sweep_points(g: Group, law: Sweep, lam: Impulses, body, one):
+    """As ``sweep``, point after point, without those that are dead in every world.
+
+    The pairs are in the order of their colours, so the result is that of ``_sweep_colours``.
+    """
+    rows = g.rows
+    slots, pairs, worlds = rows.phi.shape
+    at = lambda c, k, axis: jax.lax.dynamic_slice_in_dim(c, k if c.shape[axis] > 1 else 0, 1, axis)
+    row_b = jnp.asarray(rows.b.rows)
+    row_a = None if rows.a is None else jnp.asarray(rows.a.rows)
+
+    def of_pair(tree, pair):
+        return jax.tree.map(lambda c: c if jnp.ndim(c) < 2 else at(c, pair, 0), tree)
+
+    def of_point(tree, pair, slot):
+        cut = lambda c: of_pair(c, pair) if jnp.ndim(c) < 3 else at(at(c, slot, 0), pair, 1)[0]
+        return jax.tree.map(cut, tree)
+
+    def point(carry):
+        k, body, lam = carry
+        number = g.points.order[k]
+        pair, slot = number // slots, number % slots
+        ends = [r[pair] for r in (row_b, row_a) if r is not None]
+        # read once: what is read later, in the kernels that use it, would have to be copied before it is written
+        old = of_point(lam, pair, slot)
+        local = [jax.tree.map(lambda c: at(c, end, 0), body) for end in ends]
+        old, local = materialise((old, local), one)
+        flat = (rows.n, rows.mu, g.t1, g.t2, g.inv_mass_b, g.inv_mass_a, g.inertia_b, g.inertia_a, g.couples)
+        own = of_point((rows.rb, rows.ra, rows.surface, g.mass_1, g.mass_2, law), pair, slot)
+        new, l = _point(_pair(rows, *of_pair(flat, pair)), (*own, old), (*local, None)[:2], one)
+        for end, values in zip(ends, new):
+            body = jax.tree.map(lambda c, v: jax.lax.dynamic_update_slice_in_dim(c, v, end, axis=0), body, values)
+        put = lambda c, v: jax.lax.dynamic_update_slice(c, v[None], (slot, pair, jnp.zeros_like(slot)))
+        return k + 1, body, jax.tree.map(put, lam, l)
+
+    lam = jax.tree.map(lambda c: jnp.broadcast_to(c, rows.phi.shape), lam)
+    body = jax.tree.map(lambda c: jnp.broadcast_to(c, (c.shape[0], worlds)), body)
+    _, body, lam = jax.lax.while_loop(lambda c: c[0] < g.points.count, point, (jnp.int32(0), body, lam))
+    return body, lam
+
+
 def _pair(rows: Rows, n, mu, t1, t2, inv_mass_b, inv_mass_a, inertia_b, inertia_a, couples, a=None, b=None) -> Group:
     """What ``_point`` needs of the pairs of one colour."""
     bare = rows._with(
@@ -355,6 +427,7 @@ def _pair(rows: Rows, n, mu, t1, t2, inv_mass_b, inv_mass_a, inertia_b, inertia_
         surface_spin=None,
         feature=None,
         law=None,
+        meets=None,
         a=a,
         b=b,
     )

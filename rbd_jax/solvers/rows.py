@@ -25,6 +25,7 @@ import numpy as np
 from ..bodies import Inertia
 from ..spatial import Quat, Vec3, components, tangent_basis
 from ..struct import static, struct
+from ..xla import in_one_function
 
 
 class Index:
@@ -169,8 +170,22 @@ def add_rows(x: jax.Array, index, values: jax.Array, unique: bool = False) -> ja
         rows = index.rows
         if len(rows) == x.shape[0] and np.array_equal(rows, np.arange(len(rows))):
             return x + values
+        if in_one_function():
+            return _added_in_turn(x, rows, values)
         return x.at[rows].add(values, unique_indices=unique)
     return x.at[index, jnp.arange(x.shape[1])[None, :]].add(values)
+
+
+def _added_in_turn(x: jax.Array, rows: np.ndarray, values: jax.Array) -> jax.Array:
+    x = jnp.broadcast_to(x, (x.shape[0], np.broadcast_shapes(x.shape[1:], values.shape[1:])[0]))
+
+    def add(x, row_value):
+        row, value = row_value
+        old = jax.lax.dynamic_index_in_dim(x, row, axis=0)
+        return jax.lax.dynamic_update_slice_in_dim(x, old + value[None], row, axis=0), None
+
+    values = jnp.broadcast_to(values, (len(rows), values.shape[1]))
+    return jax.lax.scan(add, x, (jnp.asarray(rows), values))[0]
 
 
 def inverse_inertia(inertia: Inertia, q: Quat) -> InverseInertia:

@@ -1,0 +1,149 @@
+"""Layer 8: a call with a large batch, spread over the cores of a CPU or over several devices.
+
+Only calls that are made, not traced, are spread: within ``jax.jit`` a rollout is part of a program whose place the
+user decides. The results are the same to the bit (``tiles``).
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import functools
+import os
+import typing
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .model import Model
+from .state import State, Wrench
+from .tiles import LANES, flattened, on_cpu, padded, per_world, tiled
+
+#: Steps of worlds of a call for which threads are worth their start (0.2 ms).
+LEAST = 20_000
+
+AXIS = "worlds"
+
+
+class Means(typing.NamedTuple):
+    """What a call may use: several devices, or several threads of one CPU; neither for a traced call."""
+
+    devices: tuple = ()
+    cores: int = 1
+
+
+_limit: int | None = None
+
+
+def use_cores(count: int | None) -> None:
+    """Set how many cores of a CPU a rollout of many worlds may use: all (None, the default) or ``count``.
+
+    Raises:
+      ValueError: count is not an integer >= 1.
+    """
+    global _limit
+    if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < 1):
+        raise ValueError(f"use_cores: count = {count!r} must be an integer >= 1, or None for all")
+    _limit = count
+
+
+def cores() -> int:
+    """Cores that a rollout may use."""
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return count if _limit is None else min(_limit, count)
+
+
+def means(args, worlds: int, steps: int) -> Means:
+    """What the call with the arrays ``args`` may use.
+
+    Several devices are used where JAX has them and the arrays are not committed to one of them.
+    """
+    if worlds <= LANES or worlds * steps < LEAST or jax.config.jax_disable_jit:
+        return Means()
+    leaves = jax.tree.leaves(args)
+    if any(isinstance(c, jax.core.Tracer) for c in leaves):
+        return Means()
+    arrays = [c for c in leaves if isinstance(c, jax.Array)]
+    where = {c.sharding for c in arrays if c.committed}
+    devices = jax.local_devices()
+    if len(devices) > 1 and jax.process_count() == 1 and all(len(s.device_set) == len(devices) for s in where):
+        return Means(devices=tuple(devices))
+    if on_cpu() and all(s.num_devices == 1 for s in where):
+        return Means(cores=cores())
+    return Means()
+
+
+# --- threads ---
+
+
+@functools.cache
+def _pool(count: int) -> concurrent.futures.ThreadPoolExecutor:
+    return concurrent.futures.ThreadPoolExecutor(count, thread_name_prefix="rbd_jax")
+
+
+@functools.partial(jax.jit, static_argnums=(0, 5, 6))
+def _share(core, model, state, wrench, first, batch, parts):
+    return tiled(core, model, state, wrench, batch, first, parts)
+
+
+@functools.partial(jax.jit, static_argnums=(1,))
+def _joined(parts, batch):
+    size = int(np.prod(batch))
+    return jax.tree.map(lambda *c: jnp.concatenate(c)[:size].reshape(*batch, *c[0].shape[1:]), *parts)
+
+
+def lowered_share(core, model, state, batch, parts: int):
+    """The program of one of ``parts`` shares, lowered; model and state may be shapes."""
+    return _share.lower(core, model, state, None, np.int32(0), batch, parts)
+
+
+_compiled: set = set()
+
+
+def over_cores(core, count: int, model: Model, state: State, wrench: Wrench | None, batch: tuple[int, ...]):
+    """``core(model, state, wrench)`` with a share of the batch on each of ``count`` threads; waits for the result."""
+    wide, device = jax.config.jax_enable_x64, jax.config.jax_default_device
+
+    def part(first):
+        if (wide, device) == (jax.config.jax_enable_x64, jax.config.jax_default_device):
+            return jax.block_until_ready(_share(core, model, state, wrench, first, batch, count))
+        with jax.enable_x64(wide), jax.default_device(device):  # settings of a context belong to its thread
+            return jax.block_until_ready(_share(core, model, state, wrench, first, batch, count))
+
+    numbers = [np.int32(k) for k in range(count)]
+    leaves, tree = jax.tree.flatten((model, state, wrench))
+    key = (core, tree, tuple((jnp.shape(c), c.dtype) for c in leaves), batch, count, wide)
+    out = []
+    if key not in _compiled:  # else every thread would compile the same program
+        out.append(part(numbers.pop(0)))
+        _compiled.add(key)
+    out += _pool(count).map(part, numbers)
+    return _joined(tuple(out), batch)
+
+
+# --- devices ---
+
+
+def _shard(core, model, state, wrench, mesh, batch):
+    size = int(np.prod(batch))
+    args = flattened(model, state, wrench, batch)
+    varies = per_world(*args)
+    whole = padded(size, mesh.size)
+    grow = lambda c: jnp.concatenate([c, jnp.broadcast_to(c[-1:], (whole - size, *c.shape[1:]))])
+    args = jax.tree.map(lambda c, own: grow(c) if own and whole > size else c, args, varies)
+    split, same = jax.sharding.PartitionSpec(AXIS), jax.sharding.PartitionSpec()
+    specs = jax.tree.map(lambda own: split if own else same, varies)
+    run = lambda *args: tiled(core, *args, (whole // mesh.size,))
+    out = jax.shard_map(run, mesh=mesh, in_specs=specs, out_specs=split, check_vma=False)(*args)
+    return jax.tree.map(lambda c: c[:size].reshape(*batch, *c.shape[1:]), out)
+
+
+_sharded = jax.jit(_shard, static_argnums=(0, 4, 5))
+_sharded_donated = jax.jit(_shard, static_argnums=(0, 4, 5), donate_argnums=(2,))
+
+
+def over_devices(core, devices, model: Model, state: State, wrench: Wrench | None, batch, donate: bool):
+    """``core(model, state, wrench)`` with the batch sharded over ``devices``."""
+    mesh = jax.sharding.Mesh(np.array(devices), (AXIS,))
+    call = _sharded_donated if donate else _sharded
+    return call(core, model, state, wrench, mesh, tuple(batch))

@@ -1,0 +1,172 @@
+"""Layer 8: how a batch is cut on a CPU: into tiles that stay in a core's cache, over all cores.
+
+XLA's CPU backend runs a program as a list of kernels, 0.2 us and more apart, and hands the large ones to its
+threads piece by piece. A rollout is thousands of kernels of microseconds, so both cost more than the arithmetic.
+Instead a batch is cut into tiles of a few hundred worlds, each of which runs all its steps
+
+* as one function, where all operations are of a kind that XLA can compile so (``single``),
+* on one core, while the other cores run other tiles (``spread``).
+
+Every tile is ``LANES`` wide or a multiple of it, the last one filled up with copies of a world: the arithmetic of a
+world does not depend on how many there are, or on which core runs it.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental.xla_metadata import set_xla_metadata
+
+from .model import BASE_NDIM, Model
+from .state import State, Wrench
+from .xla import one_function
+
+#: Worlds of a tile at most: 256 balls are 20 kB, a quarter of what they need in a step.
+TILE = 128
+#: A tile is a multiple of this: no vector loop of XLA leaves a rest that is computed one by one.
+LANES = 32
+#: Operations that XLA's CPU backend can emit inside one function (not: sort, scatter, sums, linear algebra, callbacks).
+PLAIN = frozenset(
+    """
+    abs acos acosh add add_any and asin asinh atan atan2 atanh bitcast_convert_type broadcast_in_dim cbrt ceil clamp
+    closed_call concatenate cond convert_element_type copy copy_p core_call cos cosh custom_jvp_call custom_vjp_call
+    custom_vmap_call div dynamic_slice dynamic_update_slice eq eq_to erf exp exp2 expand_dims expm1 floor gather ge gt
+    integer_pow iota is_finite jit le log log1p logistic lt max min mul ne neg nextafter not or pad pjit population_count
+    pow reduce_and reduce_or rem reshape rev round rsqrt scan select_n
+    shift_left shift_right_arithmetic shift_right_logical sign sin sinh slice split sqrt square squeeze stop_gradient sub
+    tan tanh transpose while xor
+    """.split()
+)
+
+
+def on_cpu() -> bool:
+    return jax.default_backend() == "cpu"
+
+
+# --- one function ---
+
+
+def single(run):
+    """``run``, compiled into one function of the CPU where its operations allow it; no effect elsewhere."""
+
+    def call(*args):
+        if not on_cpu():
+            return run(*args)
+        # XLA's emitter of such functions cannot pass an argument by that nothing in them uses, so all are results too.
+        inner = jax.jit(lambda *args: (run(*args), args))
+        with one_function():
+            if not _plain(jax.make_jaxpr(inner)(*args).jaxpr):
+                inner = None
+            else:
+                out = inner(*args)
+        if inner is None:
+            return run(*args)
+        # XLA's own mark of a call that its CPU backend emits as one function; it sets it on tiny loops itself.
+        return set_xla_metadata(out, xla_cpu_small_call="true", inlineable="false")[0]
+
+    return call
+
+
+def _plain(jaxpr) -> bool:
+    return all(
+        e.primitive.name in PLAIN and not e.effects and all(_plain(j) for j in _inside(e.params)) for e in jaxpr.eqns
+    )
+
+
+def _inside(params):
+    """The jaxprs among an operation's parameters."""
+    for value in params.values():
+        for item in value if isinstance(value, (tuple, list)) else (value,):
+            item = getattr(item, "jaxpr", item)
+            if hasattr(item, "eqns"):
+                yield item
+
+
+# --- tiles ---
+
+
+def width_of(worlds: int, parts: int = 1) -> tuple[int, int]:
+    """(tiles, worlds of a tile) for a batch over ``parts`` cores: tiles is a multiple of parts, or less than it."""
+    tiles = -(-worlds // TILE)
+    if worlds > LANES:
+        tiles = -(-tiles // parts) * parts
+    width = -(-worlds // tiles)
+    if worlds >= LANES:
+        width = -(-width // LANES) * LANES
+    return -(-worlds // width), width
+
+
+def padded(worlds: int, parts: int) -> int:
+    """The least number of worlds that ``parts`` devices share equally, LANES or a multiple of it each."""
+    each = -(-worlds // parts)
+    return parts * (-(-each // LANES) * LANES if worlds >= LANES else each)
+
+
+def per_world(model: Model, state: State, wrench: Wrench | None):
+    """Which leaves have batch axes: trees of bool."""
+    own = {name: c is not None and c.ndim > model.base_ndim(name) for name, c in _leaves(model)}
+    marks = model._with(laws=jax.tree.map(lambda c: False, model.laws), **own)
+    return marks, jax.tree.map(lambda c: True, state), jax.tree.map(lambda c: jnp.ndim(c) > 2, wrench)
+
+
+def flattened(model: Model, state: State, wrench: Wrench | None, batch: tuple[int, ...]):
+    """The same with one batch axis; the axes of a leaf are the first of ``batch``."""
+
+    def flat(c, own: int):
+        mine = c.ndim - own
+        if not mine:
+            return c
+        full = (*c.shape[:mine], *(1,) * (len(batch) - mine), *c.shape[mine:])
+        return jnp.broadcast_to(c.reshape(full), (*batch, *c.shape[mine:])).reshape(-1, *c.shape[mine:])
+
+    model = model._with(**{name: flat(c, model.base_ndim(name)) for name, c in _leaves(model)})
+    state = jax.tree.map(lambda c: jnp.reshape(c, (-1, *c.shape[len(batch) :])), state)
+    return model, state, jax.tree.map(lambda c: flat(c, 2), wrench)
+
+
+def _leaves(model: Model):
+    for name in ("inertia", *BASE_NDIM):
+        value = getattr(model, name)
+        if value is not None:
+            yield name, value
+
+
+def tiled(core, model: Model, state: State, wrench: Wrench | None, batch: tuple[int, ...], first=0, parts: int = 1):
+    """``core(model, state, wrench)``, a tree of arrays with the batch in front, tile by tile.
+
+    first, parts: of ``parts`` equal shares that with number ``first`` (may be traced); its results have one batch
+    axis and include the worlds that fill up the last tile.
+    """
+    worlds = int(np.prod(batch))
+    if not on_cpu():
+        return core(model, state, wrench)
+    tiles, width = width_of(worlds, parts)
+    if tiles * width == worlds and tiles == 1 and parts == 1:
+        return single(core)(model, state, wrench)
+    args = flattened(model, state, wrench, batch)
+    varies = per_world(*args)
+    fold = lambda c, b: _folded(c, worlds, tiles, width) if b else c
+    args = jax.tree.map(fold, args, varies)
+    run, share = single(core), -(-tiles // parts)
+
+    def tile(k):
+        at = lambda c, b: jax.lax.dynamic_index_in_dim(c, k, keepdims=False) if b else c
+        return run(*jax.tree.map(at, args, varies))
+
+    if share == 1:
+        out = tile(first)
+    else:
+        out = jax.lax.map(tile, first * share + jnp.arange(share, dtype=jnp.int32))
+        out = jax.tree.map(lambda c: c.reshape(-1, *c.shape[2:]), out)
+    if parts > 1:
+        return out
+    return jax.tree.map(lambda c: c[:worlds].reshape(*batch, *c.shape[1:]), out)
+
+
+def _folded(c, worlds: int, tiles: int, width: int):
+    """(worlds, ...) as (tiles, width, ...), the last world repeated."""
+    rest = tiles * width - worlds
+    if rest:
+        c = jnp.concatenate([c, jnp.broadcast_to(c[-1:], (rest, *c.shape[1:]))])
+    return c.reshape(tiles, width, *c.shape[1:])

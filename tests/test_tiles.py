@@ -1,0 +1,300 @@
+"""How a batch is cut: one function of the CPU, tiles, cores, devices; the bits of a world do not depend on it."""
+
+import os
+import pathlib
+import subprocess
+import sys
+import textwrap
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rbd_jax as rbd
+from rbd_jax import tiles
+from rbd_jax.memory import available, refuse
+
+ROOT = pathlib.Path(__file__).parents[1]
+PLANE = rbd.Geom(rbd.Plane(), friction=0.5)
+CUBE = rbd.Box((0.1, 0.1, 0.1))
+SCENES = {
+    "ball": rbd.Scene([rbd.Body("a", rbd.Sphere(0.1), pos=(0, 0, 0.15), friction=0.5)], [PLANE], dt=0.004),
+    "free box": rbd.Scene([rbd.Body("a", rbd.Box((0.1, 0.2, 0.3)), omega=(1, 2, 3))], dt=0.004),
+    "two boxes": rbd.Scene(
+        [rbd.Body("a", CUBE, pos=(0, 0, 0.1), friction=0.5), rbd.Body("b", CUBE, pos=(0.03, 0, 0.302), friction=0.5)],
+        [PLANE],
+        dt=0.004,
+    ),
+    "three balls": rbd.Scene(
+        [rbd.Body(f"b{k}", rbd.Sphere(0.1), pos=(0.15 * (k % 2), 0, 0.1 + 0.17 * k), friction=0.5) for k in range(3)],
+        [PLANE],
+        dt=0.004,
+    ),
+}
+STEPS = 40
+
+
+@pytest.fixture(scope="module", autouse=True)
+def all_cores():
+    yield
+    rbd.use_cores(None)
+
+
+@pytest.fixture(scope="module", params=list(SCENES))
+def worlds(request):
+    model, one = rbd.build(SCENES[request.param], method="fast")
+    rng = np.random.default_rng(0)
+    state = rbd.batch(one, 300)
+    state = state.replace(vel=0.5 * rng.normal(size=(300, one.n, 3)), omega=2 * rng.normal(size=(300, one.n, 3)))
+    return request.param, model, state
+
+
+def cut(tree, count):
+    return jax.tree.map(lambda c: c[:count], tree)
+
+
+def bits(state):
+    return [np.asarray(c) for c in jax.tree.leaves(state)]
+
+
+def same(a, b):
+    return all(np.array_equal(x, y, equal_nan=True) for x, y in zip(bits(a), bits(b), strict=True))
+
+
+def run(model, state, **options):
+    return rbd.rollout(model, state, STEPS, every=20, **options)
+
+
+def test_bits_do_not_depend_on_batch_size_nor_on_cores(worlds):
+    name, model, state = worlds
+    rbd.use_cores(1)
+    final, traj = run(model, state)
+    assert np.isfinite(np.asarray(final.pos)).all() and not np.asarray(final.status).any()
+    for size in (32, 45, 128, 129):
+        few, samples = run(model, cut(state, size))
+        assert same(few, cut(final, size)), f"{name}: {size} worlds differ from the first of 300"
+        assert same(samples, cut(traj, size))
+    jitted = jax.jit(run)(model, state)
+    assert same(jitted, (final, traj))
+
+
+def test_bits_do_not_depend_on_threads(worlds, monkeypatch):
+    from rbd_jax import spread
+
+    name, model, state = worlds
+    monkeypatch.setattr(spread, "LEAST", 0)
+    rbd.use_cores(1)
+    alone = run(model, state)
+    for count in (2, 3):
+        monkeypatch.setattr(spread, "cores", lambda count=count: count)
+        assert spread.means((model, state), 300, STEPS).cores == count
+        assert same(run(model, state), alone), f"{name}: {count} threads"
+
+
+def test_the_step_runs_as_one_function(worlds):
+    _, model, state = worlds
+    compiled = jax.jit(run).lower(model, state).compile().as_text()
+    if jax.default_backend() == "cpu":
+        assert 'xla_cpu_small_call="true"' in compiled.split("ENTRY")[0] + compiled
+
+
+def test_one_function_gives_what_kernels_give(worlds):
+    """The program that is differentiated goes through colours, the direct one through the live points in their order."""
+    _, model, state = worlds
+    direct = run(model, cut(state, 32))[0]
+    other = jax.jvp(lambda s: run(model, s)[0], (cut(state, 32),), (jax.tree.map(tangent, cut(state, 32)),))[0]
+    for a, b in zip(bits(direct), bits(other), strict=True):
+        np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-4)
+
+
+def tangent(c):
+    return jnp.zeros_like(c) if jnp.issubdtype(c.dtype, jnp.floating) else np.zeros(c.shape, jax.dtypes.float0)
+
+
+def test_what_has_no_place_in_one_function_runs_as_kernels():
+    call = tiles.single(lambda x: (jnp.sort(x), x.sum()))
+    x = jnp.asarray([3.0, 1.0, 2.0])
+    assert np.array_equal(jax.jit(call)(x)[0], [1, 2, 3])
+    assert "xla_cpu_small_call" not in jax.jit(call).lower(x).as_text()
+
+
+def test_an_argument_that_nothing_uses_is_no_trouble():
+    call = jax.jit(tiles.single(lambda x, y: x * 2), keep_unused=True)
+    assert float(call(jnp.float32(3), jnp.arange(5.0))) == 6
+
+
+def test_batch_axes_of_model_and_wrench_are_cut_too():
+    model, one = rbd.build(SCENES["ball"], method="fast")
+    mass = 1.0 + np.arange(300.0, dtype=np.float32)
+    push = rbd.Wrench(force=jnp.asarray(np.random.default_rng(0).normal(size=(300, 1, 3)), jnp.float32))
+    state = rbd.batch(one, 300)
+    final = rbd.rollout(model.replace(mass=mass[:, None]), state, 20, every=20, control=push)[0]
+    at = 299
+    alone = rbd.rollout(
+        model.replace(mass=mass[at:, None]), cut(state, 1), 20, every=20,
+        control=rbd.Wrench(force=push.force[at:]),
+    )[0]  # fmt: skip
+    np.testing.assert_allclose(np.asarray(final.pos)[at], np.asarray(alone.pos)[0], rtol=1e-6, atol=1e-6)
+    folded = jax.tree.map(lambda c: c.reshape(3, 100, *c.shape[1:]), state)
+    wide = rbd.rollout(
+        model.replace(mass=mass.reshape(3, 100, 1)), folded, 20, every=20,
+        control=rbd.Wrench(force=push.force.reshape(3, 100, 1, 3)),
+    )[0]  # fmt: skip
+    assert same(jax.tree.map(lambda c: c.reshape(300, *c.shape[2:]), wide), final)
+    rows = model.replace(mass=mass[:3, None])  # one mass for every hundred worlds
+    tall = rbd.rollout(rows, folded, 20, every=20, control=rbd.Wrench(force=jnp.ones((1, 3))))[0]
+    assert tall.batch_shape == (3, 100) and np.isfinite(np.asarray(tall.pos)).all()
+
+
+DEVICES = """
+    import jax, numpy as np, rbd_jax as rbd, hashlib, sys
+    body = rbd.Body("a", rbd.Box((0.1, 0.1, 0.1)), pos=(0, 0, 0.12), friction=0.5)
+    scene = rbd.Scene([body], [rbd.Geom(rbd.Plane(), friction=0.5)], dt=0.004)
+    model, one = rbd.build(scene, method="fast")
+    state = rbd.batch(one, 1001).replace(omega=np.random.default_rng(0).normal(size=(1001, 1, 3)))
+    final, traj = rbd.rollout(model, state, 40, every=20)
+    assert final.pos.shape == (1001, 1, 3) and traj.pos.shape == (1001, 3, 1, 3)
+    if len(jax.devices()) > 1:
+        from rbd_jax import spread
+        assert len(spread.means((model, state), 1001, 40).devices) == len(jax.devices())
+        again, _ = rbd.rollout(model, final, 40, every=40)  # already where it belongs
+        assert len(final.x.x.sharding.device_set) in (1, len(jax.devices()))
+    print(hashlib.sha1(b"".join(np.asarray(c).tobytes() for c in jax.tree.leaves((final, traj)))).hexdigest())
+"""
+
+
+def test_bits_do_not_depend_on_devices():
+    """1,001 worlds on one, two and three host devices; the number does not divide."""
+    digests = set()
+    for count in (1, 2, 3):
+        flags = f"--xla_force_host_platform_device_count={count}"
+        env = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
+        done = subprocess.run(
+            [sys.executable, "-c", textwrap.dedent(DEVICES)], capture_output=True, text=True, env=env, timeout=300
+        )
+        assert done.returncode == 0, done.stderr[-2000:]
+        digests.add(done.stdout.split()[-1])
+    assert len(digests) == 1
+
+
+def test_donated_states_are_used_up_or_kept():
+    model, one = rbd.build(SCENES["ball"], method="fast")
+    kept, given = rbd.batch(one, 8), rbd.batch(one, 8)
+    expected = rbd.rollout(model, kept, 10, every=10)[0]
+    assert same(rbd.rollout(model, given, 10, every=10, donate=True)[0], expected)
+    assert given.x.x.is_deleted() and not kept.x.x.is_deleted()
+
+
+# --- bad input ---
+
+
+def test_no_worlds():
+    model, one = rbd.build(SCENES["ball"], method="fast")
+    with pytest.raises(ValueError, match="batch size 0"):
+        rbd.rollout(model, cut(rbd.batch(one, 4), 0), 10)
+    with pytest.raises(ValueError, match="batch size = 0"):
+        rbd.batch(one, 0)
+
+
+def test_two_precisions():
+    model, one = rbd.build(SCENES["ball"], method="fast")
+    wide = one._with(x=one.x.map(lambda c: np.asarray(c, np.float64)))
+    with pytest.raises(ValueError, match="float64, the model is float32"):
+        rbd.rollout(model, wide, 10)
+
+
+@pytest.mark.parametrize("count", (0, -1, True, 1.5, "all"))
+def test_cores_that_do_not_exist(count):
+    with pytest.raises(ValueError, match="use_cores"):
+        rbd.use_cores(count)
+
+
+def test_more_memory_than_there_is():
+    model, one = rbd.build(SCENES["ball"], method="fast")
+    with pytest.raises(MemoryError, match=r"1,000,000,001 samples of 64 worlds need .* TB, the device has .* left"):
+        rbd.rollout(model, rbd.batch(one, 64), 1_000_000_000)
+    refuse(one, 1, 1000, 1)
+
+
+def test_a_control_that_calls_the_host():
+    """A host callback is allowed in a control function; it runs as a kernel of its own, once a step."""
+    model, one = rbd.build(SCENES["ball"], method="fast")
+    seen = []
+
+    def push(pos):
+        seen.append(pos.shape)
+        return np.asarray([[0.0, 0.0, 1.0]], np.float32)
+
+    def control(model, state):
+        shape = jax.ShapeDtypeStruct((1, 3), np.float32)
+        return rbd.Wrench(force=jax.pure_callback(push, shape, state.pos))
+
+    final = rbd.rollout(model, one, 5, every=5, control=control)[0]
+    jax.block_until_ready(final)
+    assert len(seen) >= 5
+    steady = rbd.rollout(model, one, 5, every=5, control=rbd.Wrench(force=jnp.asarray([[0.0, 0.0, 1.0]])))[0]
+    np.testing.assert_allclose(np.asarray(final.pos), np.asarray(steady.pos), atol=1e-6)
+
+
+# --- memory ---
+
+MEASURED = """
+    import os, sys, threading, time, rbd_jax as rbd, jax
+    body = rbd.Body("a", rbd.Sphere(0.1), pos=(0, 0, 0.15), friction=0.5)
+    model, one = rbd.build(rbd.Scene([body], [rbd.Plane()], dt=0.004), method="fast")
+    rbd.use_cores(int(sys.argv[1]))
+    state, steps = rbd.batch(one, 4096), 2000
+    estimate = rbd.memory_estimate(model, 4096, steps)
+    jax.block_until_ready(rbd.rollout(model, state, steps))
+    jax.clear_caches()
+    resident = lambda: int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    before, most, done = resident(), 0, False
+    def watch():
+        global most
+        while not done:
+            most = max(most, resident())
+            time.sleep(0.002)
+    thread = threading.Thread(target=watch)
+    thread.start()
+    out = jax.block_until_ready(rbd.rollout(model, state, steps))
+    done = True
+    thread.join()
+    print(estimate, file=sys.stderr)
+    print(estimate.peak, most - before)
+"""
+
+
+@pytest.mark.parametrize("cores", (1, 2))
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_memory_estimate_is_what_the_process_takes(cores):
+    env = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
+    code = textwrap.dedent(MEASURED)
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(cores)], capture_output=True, text=True, env=env, timeout=300
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    estimate, measured = map(int, done.stdout.split())
+    assert 0.8 < estimate / measured < 1.2, done.stderr
+
+
+def test_memory_estimate_refuses_nonsense():
+    model, _ = rbd.build(SCENES["ball"], method="fast")
+    for bad in ({"batch": 0}, {"steps": 0}, {"every": 0}, {"batch": 1.5}):
+        with pytest.raises(ValueError, match=f"memory_estimate: {next(iter(bad))} = "):
+            rbd.memory_estimate(model, **{"batch": 4, "steps": 4, "every": 1, **bad})
+    estimate = rbd.memory_estimate(model, (2, 3), 10)
+    assert estimate.results > estimate.arguments > 0 and estimate.peak == round(6 * estimate.per_world)
+    assert "a world" in str(estimate) and (available() is None or available() > 0)
+
+
+def test_export_and_load(tmp_path):
+    """A rollout as a file, run in a process that builds no scene (docs: performance)."""
+    model, one = rbd.build(SCENES["ball"], method="fast")
+    state = rbd.batch(one, 64)
+    leaves, tree = jax.tree.flatten((model, state))
+    pos = lambda *leaves: rbd.rollout(*tree.unflatten(leaves), 20, every=20)[0].pos
+    path = tmp_path / "rollout.bin"
+    path.write_bytes(jax.export.export(jax.jit(pos))(*leaves).serialize())
+    loaded = jax.export.deserialize(bytearray(path.read_bytes()))
+    assert np.array_equal(loaded.call(*leaves), pos(*leaves))
