@@ -124,11 +124,11 @@ def _stack(n):
 def _bin(shapes, width):
     """Bodies dropped into a bin of four upright planes; the start of the timed run is 1.5 s later, at rest but for
     rolling."""
-    side = int(np.ceil(len(shapes) ** (1 / 3)))
+    side = int((width - 0.04) / 0.22)  # as many as lie beside each other
     pitch = (width - 0.24) / (side - 1)
     place = lambda k: (pitch * (k % side - (side - 1) / 2), pitch * (k // side % side - (side - 1) / 2))
     bodies = [
-        rbd.Body(f"b{k}", shape, pos=(*place(k), 0.15 + 0.26 * (k // side**2)), friction=MU)
+        rbd.Body(f"b{k}", shape, pos=(*place(k), 0.15 + 0.3 * (k // side**2)), friction=MU)
         for k, shape in enumerate(shapes)
     ]
     half = width / 2
@@ -164,7 +164,7 @@ def pile64():
 
 
 def clutter():
-    shapes = [rbd.Sphere(0.1), rbd.Box((0.12, 0.1, 0.08)), rbd.Sphere(0.08), rbd.Box((0.1, 0.1, 0.1))] * 2
+    shapes = [rbd.Sphere(0.1), rbd.Box((0.12, 0.1, 0.1)), rbd.Sphere(0.1), rbd.Box((0.1, 0.1, 0.1))] * 2
     return _dropped(shapes, 0.6)
 
 
@@ -233,6 +233,7 @@ def measure(name, method, batches, args, env, steps, mj_worlds):
     first = worlds(one, mj_worlds, np.random.default_rng(1))
     qpos, qvel = (np.asarray(a, np.float64) for a in rbd.to_mujoco(model, first))
     initial, arrays = rival.initial(qpos, qvel), rival.allocate(mj_worlds, steps)
+    cone = rival.choose_cone(initial, steps)
     chunk = rival.tune(initial, steps)
     probes = {}
     for size in batches:
@@ -265,7 +266,7 @@ def measure(name, method, batches, args, env, steps, mj_worlds):
                 "compile_total_s": program.total_s,
                 "bad_worlds": int(np.count_nonzero(status)), "status": sorted({int(s) for s in status.ravel()}),
                 "mujoco": {
-                    "worlds": mj_worlds, "threads": rival.threads, "chunk": chunk, **spread(theirs),
+                    "worlds": mj_worlds, "threads": rival.threads, "chunk": chunk, "cone": cone, **spread(theirs),
                     "world_steps_per_s": mj_rate, "ns_per_world_step": 1e9 / mj_rate,
                 },
                 "ratio": rate / mj_rate,
@@ -528,7 +529,7 @@ def report(env, rows, extra, seconds):
 {common.header(env)}
 Made by `benchmarks/throughput.py` in {seconds:.0f} s; dt = 4 ms. Ours: `rbd.rollout` as a user calls it, float32,
 {"a thread a core" if env["sharded_over"] == 1 else f"sharded over {env['sharded_over']} host devices"}. MuJoCo: float64,
-`mujoco.rollout` with 2 threads, tuned chunks, arrays allocated before, compiling the model not counted. Both
+`mujoco.rollout` with 2 threads, tuned chunks, the faster of its friction cones, arrays allocated before, compiling the model not counted. Both
 measured in turn, synchronised; median of {len(timed[0]["runs_s"]) if timed else 0}. ns per world-step of all cores
 together.
 

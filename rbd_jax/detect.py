@@ -29,7 +29,7 @@ from .solvers.rows import Impulses, Index, Rows, take, take_tree
 from .spatial import Quat, Vec3, safe_norm
 from .state import World
 from .struct import struct
-from .xla import materialise
+from .xla import materialise, piece
 
 
 @struct
@@ -228,7 +228,7 @@ def _group(g: Group, gp: GroupParams, p: Params, world: World, number: int, reac
         )
         if g.choice is not None and g.category == "kinematic":
             margin = margin + take(_sweep_of(p, world), selected.body_b if g.flip else selected.body_a)
-    m = manifold(g, selected, world, margin, p.one)
+    m = piece(lambda *args: manifold(g, *args))(selected, world, margin, p.one)
     if g.choice is not None:  # the solver gathers from the rows: not the narrow phase again for each of them
         m = m._with(**materialise(dict(normal=m.normal, point=m.point, distance=m.distance), p.one))
     if g.padding is not None:

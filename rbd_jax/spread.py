@@ -17,7 +17,8 @@ import numpy as np
 
 from .model import Model
 from .state import State, Wrench
-from .tiles import LANES, flattened, on_cpu, padded, per_world, tiled
+from .tiles import LANES, flattened, padded, per_world, tiled
+from .xla import on_cpu
 
 #: Steps of worlds of a call for which threads are worth their start (0.2 ms).
 LEAST = 20_000

@@ -16,71 +16,23 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental.xla_metadata import set_xla_metadata
 
 from .model import BASE_NDIM, Model
 from .state import State, Wrench
-from .xla import one_function
+from .xla import on_cpu, one_function
 
 #: Worlds of a tile at most: 256 balls are 20 kB, a quarter of what they need in a step.
 TILE = 128
 #: A tile is a multiple of this: no vector loop of XLA leaves a rest that is computed one by one.
 LANES = 32
-#: Operations that XLA's CPU backend can emit inside one function (not: sort, scatter, sums, linear algebra, callbacks).
-PLAIN = frozenset(
-    """
-    abs acos acosh add add_any and asin asinh atan atan2 atanh bitcast_convert_type broadcast_in_dim cbrt ceil clamp
-    closed_call concatenate cond convert_element_type copy copy_p core_call cos cosh custom_jvp_call custom_vjp_call
-    custom_vmap_call div dynamic_slice dynamic_update_slice eq eq_to erf exp exp2 expand_dims expm1 floor gather ge gt
-    integer_pow iota is_finite jit le log log1p logistic lt max min mul ne neg nextafter not or pad pjit population_count
-    pow reduce_and reduce_or rem reshape rev round rsqrt scan select_n
-    shift_left shift_right_arithmetic shift_right_logical sign sin sinh slice split sqrt square squeeze stop_gradient sub
-    tan tanh transpose while xor
-    """.split()
-)
+#: Operations of a step that become one function: of many worlds (compiling takes 3 s), and of few, where to start
+#: kernels costs more than they do (12 s).
+LONGEST, LONGEST_OF_FEW = 4_000, 10_000
 
 
-def on_cpu() -> bool:
-    return jax.default_backend() == "cpu"
-
-
-# --- one function ---
-
-
-def single(run):
-    """``run``, compiled into one function of the CPU where its operations allow it; no effect elsewhere."""
-
-    def call(*args):
-        if not on_cpu():
-            return run(*args)
-        # XLA's emitter of such functions cannot pass an argument by that nothing in them uses, so all are results too.
-        inner = jax.jit(lambda *args: (run(*args), args))
-        with one_function():
-            if not _plain(jax.make_jaxpr(inner)(*args).jaxpr):
-                inner = None
-            else:
-                out = inner(*args)
-        if inner is None:
-            return run(*args)
-        # XLA's own mark of a call that its CPU backend emits as one function; it sets it on tiny loops itself.
-        return set_xla_metadata(out, xla_cpu_small_call="true", inlineable="false")[0]
-
-    return call
-
-
-def _plain(jaxpr) -> bool:
-    return all(
-        e.primitive.name in PLAIN and not e.effects and all(_plain(j) for j in _inside(e.params)) for e in jaxpr.eqns
-    )
-
-
-def _inside(params):
-    """The jaxprs among an operation's parameters."""
-    for value in params.values():
-        for item in value if isinstance(value, (tuple, list)) else (value,):
-            item = getattr(item, "jaxpr", item)
-            if hasattr(item, "eqns"):
-                yield item
+def single(core, worlds: int):
+    """``core`` as one function, or as few as compile soon."""
+    return one_function(core, LONGEST if worlds >= LANES else LONGEST_OF_FEW)
 
 
 # --- tiles ---
@@ -143,12 +95,12 @@ def tiled(core, model: Model, state: State, wrench: Wrench | None, batch: tuple[
         return core(model, state, wrench)
     tiles, width = width_of(worlds, parts)
     if tiles * width == worlds and tiles == 1 and parts == 1:
-        return single(core)(model, state, wrench)
+        return single(core, width)(model, state, wrench)
     args = flattened(model, state, wrench, batch)
     varies = per_world(*args)
     fold = lambda c, b: _folded(c, worlds, tiles, width) if b else c
     args = jax.tree.map(fold, args, varies)
-    run, share = single(core), -(-tiles // parts)
+    run, share = single(core, width), -(-tiles // parts)
 
     def tile(k):
         at = lambda c, b: jax.lax.dynamic_index_in_dim(c, k, keepdims=False) if b else c

@@ -15,6 +15,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
+from jax.experimental.xla_metadata import set_xla_metadata
 
 
 def opaque_one(x: jax.Array) -> jax.Array:
@@ -41,26 +42,109 @@ def materialise_linear(tree, like: jax.Array, one):
     return jax.tree.map(lambda x: x / unit, tree)
 
 
-_single = contextvars.ContextVar("single", default=False)
+# --- one function of the CPU ---
+
+#: What is being traced becomes kernels, kernels and functions for its ``piece``s, or one function.
+_kind = contextvars.ContextVar("kind", default="kernels")
+
+#: Operations that XLA's CPU backend can emit inside one function (not: sort, scatter, sums, linear algebra, callbacks).
+PLAIN = frozenset(
+    """
+    abs acos acosh add add_any and asin asinh atan atan2 atanh bitcast_convert_type broadcast_in_dim cbrt ceil clamp
+    closed_call concatenate cond convert_element_type copy copy_p core_call cos cosh custom_jvp_call custom_vjp_call
+    custom_vmap_call div dynamic_slice dynamic_update_slice eq eq_to erf exp exp2 expand_dims expm1 floor gather ge gt
+    integer_pow iota is_finite jit le log log1p logistic lt max min mul ne neg nextafter not or pad pjit
+    population_count pow reduce_and reduce_or rem reshape rev round rsqrt scan select_n shift_left
+    shift_right_arithmetic shift_right_logical sign sin sinh slice split sqrt square squeeze stop_gradient sub tan tanh
+    transpose while xor
+    """.split()
+)
+
+
+def on_cpu() -> bool:
+    return jax.default_backend() == "cpu"
 
 
 def in_one_function() -> bool:
-    """Whether what is being traced is to become one function of the CPU (``tiles``).
+    """Whether what is being traced is to become one function of the CPU.
 
     There a loop over rows costs nothing but its arithmetic and may end early, and scatters do not exist; elsewhere
     every operation of a loop's body is a kernel that is started anew each time.
     """
-    return _single.get()
+    return _kind.get() == "one"
 
 
 @contextlib.contextmanager
-def one_function(wanted: bool = True):
-    """Trace what follows for one function."""
-    token = _single.set(wanted)
+def _traced_as(kind: str):
+    token = _kind.set(kind)
     try:
         yield
     finally:
-        _single.reset(token)
+        _kind.reset(token)
+
+
+def one_function(run, longest: int | None = None):
+    """``run``, compiled into one function of the CPU where its operations allow it; no effect elsewhere.
+
+    XLA's CPU backend otherwise starts a kernel for every few operations, which takes longer than a kernel of a few
+    hundred worlds. The time to compile a function grows faster than its length: one of more than ``longest``
+    operations is cut, so that only each ``piece`` of it is one.
+
+    Forward only: loops in ``run`` may end early.
+    """
+
+    def call(*args):
+        if not on_cpu():
+            return run(*args)
+        # XLA's emitter of such functions cannot pass an argument by that nothing in them uses, so all are results too.
+        inner = jax.jit(lambda *args: (run(*args), args))
+        with _traced_as("one"):
+            length = _length(jax.make_jaxpr(inner)(*args).jaxpr)
+            fits = length is not None and (longest is None or length <= longest)
+            out = inner(*args) if fits else None
+        if fits:
+            # XLA's own mark of a call that its CPU backend emits as one function; it sets it on tiny loops itself.
+            return set_xla_metadata(out, xla_cpu_small_call="true", inlineable="false")[0]
+        if longest is None:
+            return run(*args)
+        with _traced_as("pieces"):
+            return jax.jit(run)(*args)
+
+    return call
+
+
+def piece(run):
+    """``run(*args)``, one function where the program around it is cut into pieces; else a part of that program."""
+
+    def call(*args):
+        if _kind.get() != "pieces":
+            return run(*args)
+        with _traced_as("kernels"):
+            return one_function(run)(*args)
+
+    return call
+
+
+def _length(jaxpr) -> int | None:
+    """Operations of a jaxpr with all that it calls; None where one has no place in one function."""
+    total = 0
+    for e in jaxpr.eqns:
+        if e.primitive.name not in PLAIN or e.effects:
+            return None
+        inside = [_length(j) for j in _inside(e.params)]
+        if None in inside:
+            return None
+        total += sum(inside) or 1
+    return total
+
+
+def _inside(params):
+    """The jaxprs among an operation's parameters."""
+    for value in params.values():
+        for item in value if isinstance(value, (tuple, list)) else (value,):
+            item = getattr(item, "jaxpr", item)
+            if hasattr(item, "eqns"):
+                yield item
 
 
 #: Longer axes are gone through in a loop.

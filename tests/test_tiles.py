@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import rbd_jax as rbd
-from rbd_jax import tiles
 from rbd_jax.memory import available, refuse
+from rbd_jax.xla import one_function, piece
 
 ROOT = pathlib.Path(__file__).parents[1]
 PLANE = rbd.Geom(rbd.Plane(), friction=0.5)
@@ -113,14 +113,24 @@ def tangent(c):
 
 
 def test_what_has_no_place_in_one_function_runs_as_kernels():
-    call = tiles.single(lambda x: (jnp.sort(x), x.sum()))
+    call = one_function(lambda x: (jnp.sort(x), x.sum()))
     x = jnp.asarray([3.0, 1.0, 2.0])
     assert np.array_equal(jax.jit(call)(x)[0], [1, 2, 3])
     assert "xla_cpu_small_call" not in jax.jit(call).lower(x).as_text()
 
 
+def test_a_long_program_is_cut_into_pieces():
+    part = lambda x: piece(lambda y: jnp.sin(y) * y)(x) + 1
+    x = jnp.arange(4.0)
+    whole, cut_up = (jax.jit(one_function(part, longest)) for longest in (100, 2))
+    assert np.array_equal(whole(x), cut_up(x))
+    assert whole.lower(x).as_text().count("xla_cpu_small_call") == 1
+    assert cut_up.lower(x).as_text().count("xla_cpu_small_call") == 1
+    assert "xla_cpu_small_call" not in jax.jit(part).lower(x).as_text(), "a piece alone is a part of its program"
+
+
 def test_an_argument_that_nothing_uses_is_no_trouble():
-    call = jax.jit(tiles.single(lambda x, y: x * 2), keep_unused=True)
+    call = jax.jit(one_function(lambda x, y: x * 2), keep_unused=True)
     assert float(call(jnp.float32(3), jnp.arange(5.0))) == 6
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..spatial import Vec3
 from ..struct import struct
-from ..xla import in_one_function, materialise, summed
+from ..xla import in_one_function, materialise, piece, summed
 from .base import Problem, Solution
 from .colouring import Plan, plan
 from .laws import Law
@@ -277,7 +277,7 @@ def sweeps(groups, laws, lam, body, one, count: int):
         body, lam = carry
         lam = list(lam)
         for k, g in enumerate(groups):
-            body, lam[k] = sweep(g, laws[k], lam[k], body, one)
+            body, lam[k] = piece(sweep)(g, laws[k], lam[k], body, one)
         return (body, tuple(lam)), None
 
     carry = (body, tuple(lam))

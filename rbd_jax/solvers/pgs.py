@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from ..xla import materialise
+from ..xla import materialise, piece
 from .base import Problem, Solution, Solver
 from .gauss_seidel import apply, arranged, biased, prepare, solution, sweeps
 from .laws import contact_model
@@ -34,11 +34,11 @@ class PGS(Solver):
 
     def solve(self, problem: Problem) -> Solution:
         model, one = contact_model(self, problem), problem.one
-        groups = [prepare(rows, problem) for rows in problem.rows]
+        groups = [piece(prepare)(rows, problem._with(rows=(), warm=())) for rows in problem.rows]
         body = (problem.v, problem.w)
         warm = [arranged(l, g.plan) for g, l in zip(groups, problem.warm)]
         for g, l in zip(groups, warm):
-            body = apply(g, l, body)
+            body = piece(apply)(g, l, body)
         laws = [biased(g, model.law(g.rows, g.k_n, problem)) for g in groups]
         body, lam = sweeps(groups, laws, warm, materialise(body, one), one, self.sweeps)
         return solution(problem, groups, body, lam)

@@ -13,7 +13,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from ..xla import materialise
+from ..xla import materialise, piece
 from . import single
 from .base import Problem, Solution, Solver
 from .gauss_seidel import apply, arranged, biased, prepare, relaxing, solution, sweeps
@@ -49,11 +49,11 @@ class TGS(Solver):
         if single.applies(problem):
             return single.solve(problem, model)
         one = problem.one
-        groups = [prepare(rows, problem) for rows in problem.rows]
+        groups = [piece(prepare)(rows, problem._with(rows=(), warm=())) for rows in problem.rows]
         lam = [arranged(l, g.plan) for g, l in zip(groups, problem.warm)]
         body = (problem.v, problem.w)
         for g, l in zip(groups, lam):
-            body = apply(g, l, body)
+            body = piece(apply)(g, l, body)
         body = materialise(body, one)
         soft = [biased(g, model.law(g.rows, g.k_n, problem)) for g in groups]
         body, lam = sweeps(groups, soft, lam, body, one, self.sweeps)
