@@ -121,13 +121,13 @@ def rollout(
         return _rollout_with(model, state, int(steps), int(every), control, blocks, truncate)
     _check_wrench(model, state, control)
     steps, every, batch = int(steps), int(every), batch_of(model, state.batch_shape)
-    worlds = math.prod(batch)
-    use = means((model, state, control), worlds, steps)
-    refuse(state, worlds, steps // every + 1, 1 + (use.cores > 1))
+    core = _forward(steps, every)
+    use = means(core, (model, state, control), batch, steps)
+    refuse(state, math.prod(batch), steps // every + 1, 1 + (use.cores > 1))
     if use.devices:
-        return over_devices(_forward(steps, every), use.devices, model, state, control, batch, donate)
+        return over_devices(core, use.devices, model, state, control, batch, donate)
     if use.cores > 1:
-        return over_cores(_forward(steps, every), use.cores, model, state, control, batch)
+        return over_cores(core, use.cores, model, state, control, batch)
     call = _rollout_donated if donate else _rollout
     return call(model, state, control, steps, every, blocks, truncate)
 
@@ -494,7 +494,8 @@ def program(model: Model, state: State, steps: int, every: int):
     model, state: arrays or their shapes.
     """
     batch = state.batch_shape
-    core, parts = _forward(steps, every), means(state, math.prod(batch), steps).cores
+    core = _forward(steps, every)
+    parts = means(core, (model, state, None), batch, steps).cores
     out = jax.eval_shape(core, model, state, None)
     if parts > 1:
         return lowered_share(core, model, state, batch, parts).compile(), parts, out

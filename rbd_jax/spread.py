@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import functools
+import math
 import os
 import typing
 
@@ -18,7 +19,7 @@ import numpy as np
 from .model import Model
 from .state import State, Wrench
 from .tiles import LANES, flattened, padded, per_world, tiled
-from .xla import on_cpu
+from .xla import on_cpu, waits
 
 #: Steps of worlds of a call for which threads are worth their start (0.2 ms).
 LEAST = 20_000
@@ -54,11 +55,33 @@ def cores() -> int:
     return count if _limit is None else min(_limit, count)
 
 
-def means(args, worlds: int, steps: int) -> Means:
-    """What the call with the arrays ``args`` may use.
+def means(core, args, batch: tuple[int, ...], steps: int) -> Means:
+    """What ``core(*args)`` of so many steps may use; ``args``: arrays or their shapes.
 
     Several devices are used where JAX has them and the arrays are not committed to one of them.
     """
+    use = _allowed(args, math.prod(batch), steps)
+    if use != Means() and on_cpu() and _waits(core, args):
+        return Means()
+    return use
+
+
+_waiting: dict = {}
+
+
+def _key(core, args):
+    leaves, tree = jax.tree.flatten(args)
+    return core, tree, tuple((jnp.shape(c), c.dtype) for c in leaves)
+
+
+def _waits(core, args) -> bool:
+    key = _key(core, args)
+    if key not in _waiting:
+        _waiting[key] = waits(jax.make_jaxpr(core)(*args).jaxpr)
+    return _waiting[key]
+
+
+def _allowed(args, worlds: int, steps: int) -> Means:
     if worlds <= LANES or worlds * steps < LEAST or jax.config.jax_disable_jit:
         return Means()
     leaves = jax.tree.leaves(args)
@@ -112,8 +135,7 @@ def over_cores(core, count: int, model: Model, state: State, wrench: Wrench | No
             return jax.block_until_ready(_share(core, model, state, wrench, first, batch, count))
 
     numbers = [np.int32(k) for k in range(count)]
-    leaves, tree = jax.tree.flatten((model, state, wrench))
-    key = (core, tree, tuple((jnp.shape(c), c.dtype) for c in leaves), batch, count, wide)
+    key = (_key(core, (model, state, wrench)), batch, count, wide)
     out = []
     if key not in _compiled:  # else every thread would compile the same program
         out.append(part(numbers.pop(0)))

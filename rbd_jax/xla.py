@@ -108,7 +108,7 @@ def one_function(run, longest: int | None = None):
         if longest is None:
             return run(*args)
         with _traced_as("pieces"):
-            return jax.jit(run)(*args)
+            return run(*args)
 
     return call
 
@@ -136,6 +136,20 @@ def _length(jaxpr) -> int | None:
             return None
         total += sum(inside) or 1
     return total
+
+
+#: Operations that wait, in one of XLA's threads, for work that they hand to its other threads, or for Python.
+WAITING = frozenset(
+    """
+    cholesky cholesky_update custom_call debug_callback eig eigh ffi_call hessenberg householder_product io_callback lu
+    ormqr pure_callback qr geqrf geqp3 schur svd triangular_solve tridiagonal tridiagonal_solve
+    """.split()
+)
+
+
+def waits(jaxpr) -> bool:
+    """Whether a program has such operations: two of it at a time can wait for each other for ever on a CPU."""
+    return any(e.primitive.name in WAITING or any(map(waits, _inside(e.params))) for e in jaxpr.eqns)
 
 
 def _inside(params):

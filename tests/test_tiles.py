@@ -88,7 +88,7 @@ def test_bits_do_not_depend_on_threads(worlds, monkeypatch):
     alone = run(model, state)
     for count in (2, 3):
         monkeypatch.setattr(spread, "cores", lambda count=count: count)
-        assert spread.means((model, state), 300, STEPS).cores == count
+        assert spread._allowed((model, state), 300, STEPS).cores == count
         assert same(run(model, state), alone), f"{name}: {count} threads"
 
 
@@ -124,8 +124,7 @@ def test_a_long_program_is_cut_into_pieces():
     x = jnp.arange(4.0)
     whole, cut_up = (jax.jit(one_function(part, longest)) for longest in (100, 2))
     assert np.array_equal(whole(x), cut_up(x))
-    assert whole.lower(x).as_text().count("xla_cpu_small_call") == 1
-    assert cut_up.lower(x).as_text().count("xla_cpu_small_call") == 1
+    assert "xla_cpu_small_call" in whole.lower(x).as_text() and "xla_cpu_small_call" in cut_up.lower(x).as_text()
     assert "xla_cpu_small_call" not in jax.jit(part).lower(x).as_text(), "a piece alone is a part of its program"
 
 
@@ -167,7 +166,7 @@ DEVICES = """
     assert final.pos.shape == (1001, 1, 3) and traj.pos.shape == (1001, 3, 1, 3)
     if len(jax.devices()) > 1:
         from rbd_jax import spread
-        assert len(spread.means((model, state), 1001, 40).devices) == len(jax.devices())
+        assert len(spread._allowed((model, state), 1001, 40).devices) == len(jax.devices())
         again, _ = rbd.rollout(model, final, 40, every=40)  # already where it belongs
         assert len(final.x.x.sharding.device_set) in (1, len(jax.devices()))
     print(hashlib.sha1(b"".join(np.asarray(c).tobytes() for c in jax.tree.leaves((final, traj)))).hexdigest())
@@ -186,6 +185,27 @@ def test_bits_do_not_depend_on_devices():
         assert done.returncode == 0, done.stderr[-2000:]
         digests.add(done.stdout.split()[-1])
     assert len(digests) == 1
+
+
+WAITING = """
+    import jax, numpy as np, rbd_jax as rbd
+    cubes = [rbd.Body(f"b{k}", rbd.Box((0.1, 0.1, 0.1)), pos=(0, 0, 0.1 + 0.2 * k), friction=0.6) for k in range(5)]
+    scene = rbd.Scene(cubes, [rbd.Geom(rbd.Plane(), friction=0.6)], dt=0.004)
+    model, one = rbd.build(scene, method="accurate")
+    rbd.use_cores(2)
+    jax.block_until_ready(rbd.rollout(model, rbd.batch(one, 128), 200, every=200))
+    print("done")
+"""
+
+
+@pytest.mark.parametrize("devices", (1, 2))
+def test_linear_algebra_does_not_wait_for_itself(devices):
+    """Two programs with LAPACK calls at a time wait for each other's threads for ever: such a rollout runs alone."""
+    flags = f"--xla_force_host_platform_device_count={devices}"
+    env = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
+    code = textwrap.dedent(WAITING)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env, timeout=200)
+    assert done.stdout.split() == ["done"], done.stderr[-2000:]
 
 
 def test_donated_states_are_used_up_or_kept():
