@@ -9,7 +9,7 @@ Every method is run over a sweep of steps: its error (worst of 64 worlds) and it
     slide   a box that slides to rest from 1 to 4 m/s: distance against v^2 / (2 mu g), relative
     stack   five boxes that fall 2 mm each: heights after 2 s against the rigid ones, over the half-size
 
-MuJoCo runs with its default contact, and as rigid as it may be (solref 2 dt, solimp 0.9999), Euler and implicitfast being
+MuJoCo runs with its default contact, and as rigid as it may be (solref 2 dt, solimp 0.9999); Euler and implicitfast are
 one here. Appends to equal_error.jsonl and writes equal_error.md and equal_error.png under ``--out``.
 """
 
@@ -182,8 +182,9 @@ def main(args) -> int:
             rows += new
             common.append_lines(out / "equal_error.jsonl", [{**env, "benchmark": "equal_error", **r} for r in new])
             for r in new:
-                print(f"{case:6s} {r['engine']:14s} {common.step_text(dt):>9s} error {r['error']:.2e} "
-                      f"{1e6 * r['s_per_world_second']:9.1f} us   ({time.perf_counter() - begin:.0f} s)", flush=True)  # fmt: skip
+                figures = f"error {r['error']:.2e} {1e6 * r['s_per_world_second']:9.1f} us"
+                took = time.perf_counter() - begin
+                print(f"{case:6s} {r['engine']:14s} {common.step_text(dt):>9s} {figures}   ({took:.0f} s)", flush=True)
             jax.clear_caches()
     chart(rows, out / "equal_error.png")
     (out / "equal_error.md").write_text(report(env, rows, time.perf_counter() - begin), encoding="utf-8")

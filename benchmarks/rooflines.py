@@ -3,8 +3,8 @@
     PYTHONPATH=. python benchmarks/rooflines.py                  (about 5 minutes on 2 cores)
     PYTHONPATH=. python benchmarks/rooflines.py --smoke --out /tmp/x
 
-One tile of worlds on one core, preset "fast", float32. Every scene is run twice: as one function, which is how ``rollout``
-runs it, and kernel by kernel, which is how XLA's CPU backend runs any other program and where its profiler sees what
+One tile of worlds on one core, preset "fast", float32. Every scene is run twice: as ``rollout`` runs it, as one or a
+few functions, and kernel by kernel, which is how XLA runs any other program and where its profiler sees what
 takes the time. Flops and bytes are XLA's own count for one step (every kernel's inputs and outputs, loops by their
 trip counts); "least bytes" is the state read and written once. The machine's bounds are measured: multiply-adds on an
 array in the first-level cache, a copy of an array far larger than the caches. Writes rooflines.json and rooflines.md
@@ -156,7 +156,8 @@ of the bound is an upper one. "% of bytes bound": the least bytes over the measu
 """
     for r in rows:
         cells = [[k, what, number(us), number(n)] for k, what, us, n in r["longest"]]
-        text += f"\n{throughput.TITLES[r['scene']]}\n\n{common.table(['kernel', 'made for', 'us a step', 'times a step'], cells)}\n"
+        heads = ["kernel", "made for", "us a step", "times a step"]
+        text += f"\n{throughput.TITLES[r['scene']]}\n\n{common.table(heads, cells)}\n"
     return text
 
 

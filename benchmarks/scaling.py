@@ -224,8 +224,8 @@ def report(env, rows, took) -> str:
                         f"{common.verdict(ratio, BODIES_BAR)})\n")  # fmt: skip
     late = [r for r in rows if r["row"] == "latency"]
     if late:
-        text.append("## One world [µs a step]\n\n`rollout`: inside one call. `step`: called from Python, each waited for "
-                    "by the next. MuJoCo: one thread, `rollout` and `mj_step`.\n")  # fmt: skip
+        text.append("## One world [µs a step]\n\n`rollout`: inside one call. `step`: called from Python, each waited "
+                    "for by the next. MuJoCo: one thread, `rollout` and `mj_step`.\n")  # fmt: skip
         cells = []
         for r in late:
             bar = LATENCY_BARS.get(r["scene"]) if r["method"] == "fast" else None

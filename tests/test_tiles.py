@@ -100,7 +100,7 @@ def test_the_step_runs_as_one_function(worlds):
 
 
 def test_one_function_gives_what_kernels_give(worlds):
-    """The program that is differentiated goes through colours, the direct one through the live points in their order."""
+    """The program that is differentiated goes through colours, the direct one through the live points in turn."""
     _, model, state = worlds
     direct = run(model, cut(state, 32))[0]
     other = jax.jvp(lambda s: run(model, s)[0], (cut(state, 32),), (jax.tree.map(tangent, cut(state, 32)),))[0]
