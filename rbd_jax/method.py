@@ -14,8 +14,8 @@ SUBSTEP = 1.0 / 240.0
 STACK, STACK_SIZE = 8, 0.2
 #: and masses up to this ratio;
 RATIO = 10.0
-#: a direct solve costs less than more substeps than SPLIT, up to this many boxes.
-DIRECT, SPLIT = 64, 2
+#: a direct solve costs less than the substeps of a larger one up to this many boxes.
+DIRECT = 64
 #: Sweeps of so many boxes less one; with two, a stack of four or five rocks at 0.1 m/s for seconds.
 MOST_SWEEPS = 4
 
@@ -31,11 +31,10 @@ class Method:
       solver: a name of ``rbd_jax.SOLVERS`` ("tgs", "pgs", "newton_lagged", "newton_cone", "penalty", "mujoco") or an
         instance. Any goes with any model, but "mujoco", which speaks its own only. None: the cheapest that stands:
         "tgs", with two to four sweeps for three to five and more boxes that may touch each other, or six Newton steps
-        of "newton_lagged" where these are 2 to 64 and sweeps would need more than two substeps for them, a substep
-        being 1/240 s min(1, 8 / boxes) min(1, sqrt(size / 0.2 m)) at most, or where their masses differ by more than
-        10 : 1.
+        of "newton_lagged" where these are 2 to 64 and sweeps would need substeps for them, which is where
+        dt > 1/240 s min(1, 8 / boxes) min(1, sqrt(size / 0.2 m)) or where their masses differ by more than 10 : 1.
       substeps: steps inside a step of dt; None: 1, or for "tgs" and "penalty" as many as keep a substep within
-        1/240 s at the dt of ``build``, with ``solver`` None within the bound above.
+        1/240 s at the dt of ``build``.
       events: with pairs that mention restitution, impacts a world may have in a (sub)step at their own instant, with
         the position and normal they
         have there; what follows the last of them is a step of the remaining length. 0: none, an impact is
@@ -75,11 +74,10 @@ class Method:
         if integrator == "scene":
             integrator = "mujoco_" + (scene_integrator or "euler")
         integrator = make_integrator(integrator)
-        solver, longest = self.solver, SUBSTEP
+        solver = self.solver
         if solver is None:
-            if 2 <= boxes <= DIRECT:
-                longest = SUBSTEP * min(1.0, STACK / boxes) * min(1.0, math.sqrt(size / STACK_SIZE))
-            direct = 2 <= boxes <= DIRECT and (dt > SPLIT * longest or ratio > RATIO)
+            longest = SUBSTEP * min(1.0, STACK / max(boxes, 1)) * min(1.0, math.sqrt(size / STACK_SIZE))
+            direct = 2 <= boxes <= DIRECT and (dt > longest or ratio > RATIO)
             solver = TGS(sweeps=min(max(boxes - 1, 2), MOST_SWEEPS))
             if direct and self.contact in (None, "near_rigid"):
                 solver = NewtonLagged(iterations=6)
@@ -112,7 +110,7 @@ class Method:
             )
         substeps = self.substeps
         if substeps is None:
-            substeps = max(1, round(dt / longest + 0.49)) if solver.substeps else 1
+            substeps = max(1, round(dt / SUBSTEP + 0.49)) if solver.substeps else 1
         if substeps > MAX_SUBSTEPS:
             raise ValueError(f"Method: dt = {dt} s needs {substeps} substeps, at most {MAX_SUBSTEPS}: use a smaller dt")
         return Method(integrator, contact, solver, substeps, self.capacity, self.events)
