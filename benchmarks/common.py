@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import datetime
 import json
 import os
@@ -75,6 +76,15 @@ def header(env: dict) -> str:
     )
 
 
+def options(description: str, smoke: str) -> argparse.ArgumentParser:
+    """The options that the speed scripts share."""
+    parser = argparse.ArgumentParser(description=description.split("\n")[0])
+    parser.add_argument("--smoke", action="store_true", help=f"a few seconds: {smoke}")
+    parser.add_argument("--repeats", type=int, default=3, metavar="N", help="timed runs of each (default 3)")
+    parser.add_argument("--out", type=pathlib.Path, default=None, metavar="DIR", help="default benchmarks/results")
+    return parser
+
+
 def plain(value):
     """JSON without NaN: numpy to Python, non-finite numbers to None."""
     if isinstance(value, dict):
@@ -129,6 +139,17 @@ def verdict(value, bar, least=False) -> str:
     if value is None or not np.isfinite(value):
         return "MISS"
     return "ok" if (value >= bar if least else value <= bar) else "MISS"
+
+
+def least_seconds(call, repeats: int) -> float:
+    """The least time of ``call()`` after a warm-up."""
+    call()
+    times = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - begin)
+    return min(times)
 
 
 # --- our side ---

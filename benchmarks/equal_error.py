@@ -15,7 +15,6 @@ one here. Appends to equal_error.jsonl and writes equal_error.md and equal_error
 
 from __future__ import annotations
 
-import argparse
 import functools
 import pathlib
 import sys
@@ -44,9 +43,8 @@ def slide():
     speed = np.linspace(1.0, 4.0, JUDGED)
 
     def start(one, size, rng):
-        v = speed if size == JUDGED else rng.uniform(1.0, 4.0, size)
         zero = np.zeros((size, 1, 3))
-        return common.start(one, zero + [0, 0, 0.1], zero + v[:, None, None] * [1, 0, 0], zero)
+        return common.start(one, zero + [0, 0, 0.1], zero + speed[:, None, None] * [1, 0, 0], zero)
 
     def error(first, last):
         exact = speed**2 / (2 * throughput.MU * common.G)
@@ -75,7 +73,7 @@ def ours(case, dt, method, size):
     return wrong, functools.partial(throughput.called, model, many, steps), size, lambda: None
 
 
-def mujoco(case, dt, rigid, size):
+def mujoco(case, dt, rigid):
     scene, start, error = CASES[case]()
     model, one = rbd.build(scene, dt=dt, method="fast")
     rival = MuJoCo(scene, dt)
@@ -95,8 +93,8 @@ def mujoco(case, dt, rigid, size):
 ENGINES = {
     "fast": lambda case, dt, size: ours(case, dt, "fast", size),
     "accurate": lambda case, dt, size: ours(case, dt, "accurate", size),
-    "MuJoCo": lambda case, dt, size: mujoco(case, dt, False, size),
-    "MuJoCo, rigid": lambda case, dt, size: mujoco(case, dt, True, size),
+    "MuJoCo": lambda case, dt, size: mujoco(case, dt, False),
+    "MuJoCo, rigid": lambda case, dt, size: mujoco(case, dt, True),
 }
 
 
@@ -193,8 +191,4 @@ def main(args) -> int:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--smoke", action="store_true", help="a few seconds: one case, one step")
-    parser.add_argument("--repeats", type=int, default=3, metavar="N", help="timed runs of each (default 3)")
-    parser.add_argument("--out", type=pathlib.Path, default=None, metavar="DIR", help="default benchmarks/results")
-    sys.exit(main(parser.parse_args()))
+    sys.exit(main(common.options(__doc__, "one case, one step").parse_args()))

@@ -29,7 +29,7 @@ import numpy as np
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import common  # noqa: E402
 import throughput  # noqa: E402
-from common import number  # noqa: E402
+from common import least_seconds, number  # noqa: E402
 
 import rbd_jax as rbd  # noqa: E402
 from rbd_jax.memory import bytes_of  # noqa: E402
@@ -39,16 +39,6 @@ from rbd_jax.tiles import TILE  # noqa: E402
 
 SCENES = ("ball", "isotropic", "asymmetric", "box", "stack", "clutter", "pile16", "pile64")
 KERNELS = 5  # of a scene that are listed
-
-
-def seconds(call, repeats=5) -> float:
-    call()
-    times = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - begin)
-    return min(times)
 
 
 def machine() -> dict:
@@ -66,10 +56,10 @@ def machine() -> dict:
         return jax.lax.scan(body, x, None, length=count)[0]
 
     run = jax.jit(polynomials)
-    flops = 2 * terms * count * x.size / seconds(lambda: jax.block_until_ready(run(x)))
+    flops = 2 * terms * count * x.size / least_seconds(lambda: jax.block_until_ready(run(x)), 5)
     source = np.ones(64_000_000, np.float32)
     target = np.empty_like(source)
-    copied = seconds(lambda: np.copyto(target, source), 3)
+    copied = least_seconds(lambda: np.copyto(target, source), 3)
     return {"flops_per_s": flops, "bytes_per_s": 2 * source.nbytes / copied}
 
 
@@ -120,8 +110,8 @@ def measure(name, args) -> dict:
     per = 1e9 / size / steps
     return {
         "scene": name, "worlds": size, "steps": steps, "one_function": "xla_cpu_small_call" in single.as_text(),
-        "ns": per * seconds(lambda: jax.block_until_ready(single(model, state)), 3),
-        "ns_kernels": per * seconds(lambda: jax.block_until_ready(split(model, state)), 3),
+        "ns": per * least_seconds(lambda: jax.block_until_ready(single(model, state)), 3),
+        "ns_kernels": per * least_seconds(lambda: jax.block_until_ready(split(model, state)), 3),
         "flops": cost["flops"] / size, "bytes": cost["bytes"] / size,
         "least_bytes": 2 * bytes_of(state._with(memory=None)) / size,
         "kernels_per_step": launches, "longest": longest,

@@ -17,7 +17,6 @@ Appends to scaling.jsonl and writes scaling.md and scaling.png under ``--out`` (
 
 from __future__ import annotations
 
-import argparse
 import functools
 import pathlib
 import sys
@@ -30,7 +29,7 @@ import numpy as np
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import common  # noqa: E402
 import throughput  # noqa: E402
-from common import MuJoCo, number  # noqa: E402
+from common import MuJoCo, least_seconds, number  # noqa: E402
 
 import rbd_jax as rbd  # noqa: E402
 
@@ -41,19 +40,8 @@ FIT_FROM = {"batch": 2**12, "bodies": 27, "contacts": 10}
 BODIES_BAR, LATENCY_BARS = 15.0, {"ball": 30.0, "stack": 0.5}
 
 
-def best(run, repeats) -> float:
-    """Least seconds of ``run()`` after one warm-up."""
-    run()
-    times = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        run()
-        times.append(time.perf_counter() - begin)
-    return min(times)
-
-
 def seconds_a_step(model, state, steps, repeats) -> float:
-    return best(functools.partial(throughput.called, model, state, steps), repeats) / steps
+    return least_seconds(functools.partial(throughput.called, model, state, steps), repeats) / steps
 
 
 def slope(sizes, times, least) -> float | None:
@@ -141,12 +129,12 @@ def latency_rows(args):
                     state = rbd.step(model, state)
                 jax.block_until_ready(state)
 
-            single = best(by_hand, args.repeats) / few
+            single = least_seconds(by_hand, args.repeats) / few
             rival = MuJoCo(scene, throughput.DT, threads=1)
             q, v = (np.asarray(a, np.float64)[None] for a in rbd.to_mujoco(model, state))
             count = min(steps, 20_000)
             initial, arrays = rival.initial(q, v), rival.allocate(1, count)
-            theirs = best(lambda: rival.call(initial, count, arrays), args.repeats) / count
+            theirs = least_seconds(lambda: rival.call(initial, count, arrays), args.repeats) / count
 
             def mj_steps(rival=rival, initial=initial, few=few):
                 data = rival.data[0]
@@ -154,7 +142,7 @@ def latency_rows(args):
                 for _ in range(few):
                     mujoco.mj_step(rival.model, data)
 
-            mj_single = best(mj_steps, args.repeats) / few
+            mj_single = least_seconds(mj_steps, args.repeats) / few
             rival.close()
             yield {"row": "latency", "scene": name, "method": method, "steps": steps, "step_s": inside,
                    "single_step_s": single, "mujoco_step_s": theirs, "mujoco_single_step_s": mj_single,
@@ -269,9 +257,6 @@ def main(args) -> int:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--smoke", action="store_true", help="a few seconds: small sizes")
+    parser = common.options(__doc__, "small sizes")
     parser.add_argument("--rows", default="", metavar="A,B", help=f"only these: {', '.join(ROWS)}")
-    parser.add_argument("--repeats", type=int, default=3, metavar="N", help="timed runs of each (default 3)")
-    parser.add_argument("--out", type=pathlib.Path, default=None, metavar="DIR", help="default benchmarks/results")
     sys.exit(main(parser.parse_args()))

@@ -580,15 +580,7 @@ def cost(case: Case, labels, steps=200, repeats=5) -> dict:
     begin = rival.initial(np.asarray(q, float), np.asarray(v, float))
     arrays = rival.allocate(1, steps)
 
-    def best(call):
-        call()
-        took = []
-        for _ in range(repeats):
-            start = time.perf_counter()
-            call()
-            took.append(time.perf_counter() - start)
-        return min(took) / steps
-
+    best = lambda call: common.least_seconds(call, repeats) / steps
     out = {"MuJoCo [s]": best(lambda: rival.call(begin, steps, arrays))}
     rival.close()
     for label in labels:

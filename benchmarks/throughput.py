@@ -121,9 +121,10 @@ def _stack(n):
     return scene, worlds
 
 
-def _bin(shapes, width):
+def _dropped(shapes, width):
     """Bodies dropped into a bin of four upright planes; the start of the timed run is 1.5 s later, at rest but for
     rolling."""
+    n = len(shapes)
     side = int((width - 0.04) / 0.22)  # as many as lie beside each other
     pitch = (width - 0.24) / (side - 1)
     place = lambda k: (pitch * (k % side - (side - 1) / 2), pitch * (k // side % side - (side - 1) / 2))
@@ -139,12 +140,7 @@ def _bin(shapes, width):
         rbd.Geom(rbd.Plane(), pos=at, quat=turn(axis, sign * np.pi / 2), friction=MU) for at, axis, sign in upright
     ]
     scene = rbd.Scene(bodies, [rbd.Geom(rbd.Plane(), friction=MU), *walls], dt=DT)
-    return scene, functools.cache(lambda: rbd.build(scene, dt=DT, method="fast")[0])
-
-
-def _dropped(shapes, width):
-    scene, model = _bin(shapes, width)
-    n = len(shapes)
+    model = functools.cache(lambda: rbd.build(scene, dt=DT, method="fast")[0])
 
     def worlds(state, size, rng):
         pos = np.asarray(state.pos) + rng.uniform(-0.01, 0.01, (size, n, 3))

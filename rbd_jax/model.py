@@ -213,6 +213,11 @@ class Model:
             return 1 if self.structure.isotropic else 2
         return BASE_NDIM[field]
 
+    def leaves(self):
+        """(name, array) of every leaf that this scene has, but those of ``laws``."""
+        named = ((name, getattr(self, name)) for name in ("inertia", *BASE_NDIM))
+        return [(name, value) for name, value in named if value is not None]
+
     def replace(self, **leaves) -> Model:
         """Return a copy with other numbers; never recompiles unless shapes gain batch axes.
 
@@ -244,7 +249,7 @@ class Model:
 
     def __repr__(self):
         s = self.structure
-        shown = ", ".join(f for f in ("inertia", *BASE_NDIM) if getattr(self, f) is not None)
+        shown = ", ".join(name for name, _ in self.leaves())
         return f"Model({s.n} bodies, {len(s.kinds)} geoms, {sum(len(g.a) for g in s.groups)} pairs; {shown})"
 
 
@@ -348,17 +353,15 @@ def batch_of(model: Model, batch: tuple[int, ...]) -> tuple[int, ...]:
     Raises:
       ValueError: batch sizes that do not match, naming the leaf.
     """
-    for name in ("inertia", *BASE_NDIM):
-        value = getattr(model, name)
-        if value is not None:
-            own = tuple(value.shape[: value.ndim - model.base_ndim(name)])
-            k = max(len(own), len(batch))
-            try:
-                batch = np.broadcast_shapes(batch + (1,) * (k - len(batch)), own + (1,) * (k - len(own)))
-            except ValueError:
-                raise ValueError(
-                    f"batch sizes do not match: Model.{name} has batch axes {own}, the state has {batch}"
-                ) from None
+    for name, value in model.leaves():
+        own = tuple(value.shape[: value.ndim - model.base_ndim(name)])
+        k = max(len(own), len(batch))
+        try:
+            batch = np.broadcast_shapes(batch + (1,) * (k - len(batch)), own + (1,) * (k - len(own)))
+        except ValueError:
+            raise ValueError(
+                f"batch sizes do not match: Model.{name} has batch axes {own}, the state has {batch}"
+            ) from None
     return tuple(batch)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 import os
 import platform
 from importlib import metadata
@@ -16,6 +15,7 @@ import numpy as np
 from .diagnostics import energy
 from .model import BASE_NDIM, Model, batch_of
 from .state import State
+from .tiles import flattened, per_world
 from .view import Clip
 from .view.clip import rotate
 
@@ -114,17 +114,10 @@ def first_worlds(model: Model, state: State, count: int, samples: bool = True) -
     batch = state.batch_shape[: len(state.batch_shape) - inner]
     if batch_of(model, batch) != batch:
         raise ValueError(f"the model's leaves have batch axes that the state, {batch}, does not have")
-    size = math.prod(batch)
-    cut = lambda c, own: np.reshape(np.asarray(c), (size, *np.shape(c)[own:]))[:count]
-    changes = {}
-    for name in ("inertia", *BASE_NDIM):
-        value = getattr(model, name)
-        own = 0 if value is None else value.ndim - model.base_ndim(name)
-        if own:
-            tail = value.shape[own:]
-            wide = np.reshape(np.asarray(value), (*value.shape[:own], *(1,) * (len(batch) - own), *tail))
-            changes[name] = cut(np.broadcast_to(wide, (*batch, *tail)), len(batch))
-    return model._with(**changes), jax.tree.map(lambda c: cut(c, len(batch)), state)
+    model, state, _ = flattened(model, state, None, batch)
+    own, _, _ = per_world(model, state, None)
+    cut = lambda c, mine=True: np.asarray(c)[:count] if mine else c
+    return jax.tree.map(cut, model, own), jax.tree.map(cut, state)
 
 
 def clip(model: Model, traj: State, title: str = "rbd_jax", worlds: int = 16) -> Clip:

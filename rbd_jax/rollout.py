@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .memory import refuse
-from .model import BASE_NDIM, Model, batch_of
+from .model import Model, batch_of
 from .spatial import Vec3
 from .spread import lowered_share, means, over_cores, over_devices
 from .state import State, World, Wrench
@@ -442,9 +442,8 @@ def _batched_call(core, derived=None):
 def _grow_model(model: Model, batched: Model, size: int) -> Model:
     """Leaves that the mapped axis passes by keep their shape, unless they have batch axes of their own."""
     changes = {}
-    for name in ("inertia", *BASE_NDIM):
-        value, b = getattr(model, name), getattr(batched, name)
-        if value is not None and not b and value.ndim > model.base_ndim(name):
+    for name, value in model.leaves():
+        if not getattr(batched, name) and value.ndim > model.base_ndim(name):
             changes[name] = jnp.broadcast_to(value, (size, *value.shape))
     return model._with(**changes) if changes else model
 

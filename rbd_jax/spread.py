@@ -18,7 +18,7 @@ import numpy as np
 
 from .model import Model
 from .state import State, Wrench
-from .tiles import LANES, flattened, padded, per_world, tiled
+from .tiles import LANES, filled, flattened, padded, per_world, tiled
 from .xla import on_cpu, waits
 
 #: Steps of worlds of a call for which threads are worth their start (0.2 ms).
@@ -112,7 +112,7 @@ def _share(core, model, state, wrench, first, batch, parts):
 
 @functools.partial(jax.jit, static_argnums=(1,))
 def _joined(parts, batch):
-    size = int(np.prod(batch))
+    size = math.prod(batch)
     return jax.tree.map(lambda *c: jnp.concatenate(c)[:size].reshape(*batch, *c[0].shape[1:]), *parts)
 
 
@@ -129,10 +129,11 @@ def over_cores(core, count: int, model: Model, state: State, wrench: Wrench | No
     wide, device = jax.config.jax_enable_x64, jax.config.jax_default_device
 
     def part(first):
+        run = lambda: jax.block_until_ready(_share(core, model, state, wrench, first, batch, count))
         if (wide, device) == (jax.config.jax_enable_x64, jax.config.jax_default_device):
-            return jax.block_until_ready(_share(core, model, state, wrench, first, batch, count))
+            return run()
         with jax.enable_x64(wide), jax.default_device(device):  # settings of a context belong to its thread
-            return jax.block_until_ready(_share(core, model, state, wrench, first, batch, count))
+            return run()
 
     numbers = [np.int32(k) for k in range(count)]
     key = (_key(core, (model, state, wrench)), batch, count, wide)
@@ -148,12 +149,11 @@ def over_cores(core, count: int, model: Model, state: State, wrench: Wrench | No
 
 
 def _shard(core, model, state, wrench, mesh, batch):
-    size = int(np.prod(batch))
+    size = math.prod(batch)
     args = flattened(model, state, wrench, batch)
     varies = per_world(*args)
     whole = padded(size, mesh.size)
-    grow = lambda c: jnp.concatenate([c, jnp.broadcast_to(c[-1:], (whole - size, *c.shape[1:]))])
-    args = jax.tree.map(lambda c, own: grow(c) if own and whole > size else c, args, varies)
+    args = jax.tree.map(lambda c, own: filled(c, whole) if own else c, args, varies)
     split, same = jax.sharding.PartitionSpec(AXIS), jax.sharding.PartitionSpec()
     specs = jax.tree.map(lambda own: split if own else same, varies)
     run = lambda *args: tiled(core, *args, (whole // mesh.size,))

@@ -19,7 +19,7 @@ from jax.custom_derivatives import SymbolicZero
 from .bodies import Bodies
 from .detect import chosen, detect, everything
 from .events import advance_to_impacts, carried
-from .model import BASE_NDIM, Model, Params, params
+from .model import Model, Params, params
 from .solvers.base import Problem, Solution
 from .solvers.restitution import normal_velocity, targets
 from .solvers.rows import Impulses, Rows, add_rows, inverse_inertia, spread, take, take_tree
@@ -103,10 +103,7 @@ def unfit(model: Model, state: State) -> jax.Array:
             size = size + over(sum(c * 0 for c in jax.tree.leaves(tree)), axes)
     bad = ~(size <= limit(size.dtype) ** 2)
     shared = []
-    for name in ("inertia", *BASE_NDIM):
-        value = getattr(model, name)
-        if value is None:
-            continue
+    for name, value in model.leaves():
         if name.startswith("pair_"):  # there NaN means: not given
             value = jnp.where(jnp.isnan(value), 0.0, value)
         own = value.ndim - model.base_ndim(name)
@@ -156,11 +153,9 @@ def harmless(model: Model, state: State, lost: jax.Array) -> tuple[Model, State]
         ),
     )
     finite = {}
-    for name in ("inertia", *BASE_NDIM):
-        value = getattr(model, name)
-        if value is not None:
-            fine = jnp.isfinite(value) | (jnp.isnan(value) if name.startswith("pair_") else False)
-            finite[name] = jnp.where(fine, value, 1.0)
+    for name, value in model.leaves():
+        fine = jnp.isfinite(value) | (jnp.isnan(value) if name.startswith("pair_") else False)
+        finite[name] = jnp.where(fine, value, 1.0)
     return model._with(**finite), state
 
 
@@ -670,9 +665,8 @@ def _passive(p: Params, problem: Problem, solution: Solution) -> Solution:
             events = targets(rows, problem)
             left, e = (jnp.where(events.active, x, y) for x, y in ((events.left, left), (rows.e, e)))
         b, a = (_power(rows, lam, v_, w_, accel, left) for v_, w_ in ((problem.v, problem.w), (v, w)))
-        slots = summed
-        before, after = add_rows(before, rows.b, slots(b)), add_rows(after, rows.b, slots(a))
-        most = add_rows(most, rows.b, slots(-e * b))
+        before, after = add_rows(before, rows.b, summed(b)), add_rows(after, rows.b, summed(a))
+        most = add_rows(most, rows.b, summed(-e * b))
     if coupled:
         before, after, most = (summed(c)[None] for c in (before, after, most))
     gains = after > most

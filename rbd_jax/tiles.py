@@ -13,15 +13,16 @@ world does not depend on how many there are, or on which core runs it.
 
 from __future__ import annotations
 
+import math
+
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from .model import BASE_NDIM, Model
+from .model import Model
 from .state import State, Wrench
 from .xla import on_cpu, one_function
 
-#: Worlds of a tile at most: 256 balls are 20 kB, a quarter of what they need in a step.
+#: Worlds of a tile at most: with fewer a stack has more loops to start, with more its arrays leave the cache.
 TILE = 128
 #: A tile is a multiple of this: no vector loop of XLA leaves a rest that is computed one by one.
 LANES = 32
@@ -57,7 +58,7 @@ def padded(worlds: int, parts: int) -> int:
 
 def per_world(model: Model, state: State, wrench: Wrench | None):
     """Which leaves have batch axes: trees of bool."""
-    own = {name: c is not None and c.ndim > model.base_ndim(name) for name, c in _leaves(model)}
+    own = {name: c.ndim > model.base_ndim(name) for name, c in model.leaves()}
     marks = model._with(laws=jax.tree.map(lambda c: False, model.laws), **own)
     return marks, jax.tree.map(lambda c: True, state), jax.tree.map(lambda c: jnp.ndim(c) > 2, wrench)
 
@@ -72,16 +73,9 @@ def flattened(model: Model, state: State, wrench: Wrench | None, batch: tuple[in
         full = (*c.shape[:mine], *(1,) * (len(batch) - mine), *c.shape[mine:])
         return jnp.broadcast_to(c.reshape(full), (*batch, *c.shape[mine:])).reshape(-1, *c.shape[mine:])
 
-    model = model._with(**{name: flat(c, model.base_ndim(name)) for name, c in _leaves(model)})
+    model = model._with(**{name: flat(c, model.base_ndim(name)) for name, c in model.leaves()})
     state = jax.tree.map(lambda c: jnp.reshape(c, (-1, *c.shape[len(batch) :])), state)
     return model, state, jax.tree.map(lambda c: flat(c, 2), wrench)
-
-
-def _leaves(model: Model):
-    for name in ("inertia", *BASE_NDIM):
-        value = getattr(model, name)
-        if value is not None:
-            yield name, value
 
 
 def tiled(core, model: Model, state: State, wrench: Wrench | None, batch: tuple[int, ...], first=0, parts: int = 1):
@@ -90,7 +84,7 @@ def tiled(core, model: Model, state: State, wrench: Wrench | None, batch: tuple[
     first, parts: of ``parts`` equal shares that with number ``first`` (may be traced); its results have one batch
     axis and include the worlds that fill up the last tile.
     """
-    worlds = int(np.prod(batch))
+    worlds = math.prod(batch)
     if not on_cpu():
         return core(model, state, wrench)
     tiles, width = width_of(worlds, parts)
@@ -98,7 +92,7 @@ def tiled(core, model: Model, state: State, wrench: Wrench | None, batch: tuple[
         return single(core, width)(model, state, wrench)
     args = flattened(model, state, wrench, batch)
     varies = per_world(*args)
-    fold = lambda c, b: _folded(c, worlds, tiles, width) if b else c
+    fold = lambda c, b: filled(c, tiles * width).reshape(tiles, width, *c.shape[1:]) if b else c
     args = jax.tree.map(fold, args, varies)
     run, share = single(core, width), -(-tiles // parts)
 
@@ -116,9 +110,7 @@ def tiled(core, model: Model, state: State, wrench: Wrench | None, batch: tuple[
     return jax.tree.map(lambda c: c[:worlds].reshape(*batch, *c.shape[1:]), out)
 
 
-def _folded(c, worlds: int, tiles: int, width: int):
-    """(worlds, ...) as (tiles, width, ...), the last world repeated."""
-    rest = tiles * width - worlds
-    if rest:
-        c = jnp.concatenate([c, jnp.broadcast_to(c[-1:], (rest, *c.shape[1:]))])
-    return c.reshape(tiles, width, *c.shape[1:])
+def filled(c, size: int):
+    """``c`` with its last world repeated until there are ``size``."""
+    rest = size - c.shape[0]
+    return jnp.concatenate([c, jnp.broadcast_to(c[-1:], (rest, *c.shape[1:]))]) if rest else c

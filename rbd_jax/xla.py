@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import contextvars
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -51,7 +50,7 @@ _kind = contextvars.ContextVar("kind", default="kernels")
 PLAIN = frozenset(
     """
     abs acos acosh add add_any and asin asinh atan atan2 atanh bitcast_convert_type broadcast_in_dim cbrt ceil clamp
-    closed_call concatenate cond convert_element_type copy copy_p core_call cos cosh custom_jvp_call custom_vjp_call
+    closed_call concatenate cond convert_element_type copy core_call cos cosh custom_jvp_call custom_vjp_call
     custom_vmap_call div dynamic_slice dynamic_update_slice eq eq_to erf exp exp2 expand_dims expm1 floor gather ge gt
     integer_pow iota is_finite jit le log log1p logistic lt max min mul ne neg nextafter not or pad pjit
     population_count pow reduce_and reduce_or rem reshape rev round rsqrt scan select_n shift_left
@@ -165,20 +164,13 @@ def _inside(params):
 UNROLL = 16
 
 
-def _folded(f, c: jax.Array, axis: int) -> jax.Array:
-    """``c`` reduced over an axis; XLA's own reductions have no place in one function."""
-    if c.shape[axis] <= UNROLL:
-        parts = [jax.lax.index_in_dim(c, k, axis, keepdims=False) for k in range(c.shape[axis])]
-        return functools.reduce(f, parts)
-    at = lambda k: jax.lax.dynamic_index_in_dim(c, k, axis, keepdims=False)
-    return jax.lax.fori_loop(1, c.shape[axis], lambda k, a: f(a, at(k)), at(0))
-
-
 def summed(c: jax.Array, axis: int = 0) -> jax.Array:
-    """The sum of ``c`` over one axis."""
-    return _folded(jnp.add, c, axis) if in_one_function() and c.shape[axis] else c.sum(axis=axis)
-
-
-def largest(c: jax.Array, axis: int = 0) -> jax.Array:
-    """The largest of ``c`` along one axis."""
-    return _folded(jnp.maximum, c, axis) if in_one_function() else c.max(axis=axis)
+    """The sum of ``c`` over one axis; XLA's own sums have no place in one function."""
+    count = c.shape[axis]
+    if not in_one_function() or not count:
+        return c.sum(axis=axis)
+    if count <= UNROLL:
+        parts = [jax.lax.index_in_dim(c, k, axis, keepdims=False) for k in range(count)]
+        return sum(parts[1:], parts[0])
+    at = lambda k: jax.lax.dynamic_index_in_dim(c, k, axis, keepdims=False)
+    return jax.lax.fori_loop(1, count, lambda k, total: total + at(k), at(0))

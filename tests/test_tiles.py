@@ -94,9 +94,8 @@ def test_bits_do_not_depend_on_threads(worlds, monkeypatch):
 
 def test_the_step_runs_as_one_function(worlds):
     _, model, state = worlds
-    compiled = jax.jit(run).lower(model, state).compile().as_text()
-    if jax.default_backend() == "cpu":
-        assert 'xla_cpu_small_call="true"' in compiled.split("ENTRY")[0] + compiled
+    if jax.default_backend() == "cpu":  # before XLA, which puts the mark on tiny loops itself
+        assert 'xla_cpu_small_call = "true"' in jax.jit(run).lower(model, state).as_text()
 
 
 def test_one_function_gives_what_kernels_give(worlds):

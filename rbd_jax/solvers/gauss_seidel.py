@@ -319,9 +319,8 @@ def sweep(g: Group, law: Sweep, lam: Impulses, body, one):
         b = Index(rows.b.rows[start:stop])
         a = Index(rows.a.rows[start:stop]) if rows.a is not None else None
         local = (take_tree(body, b), take_tree(body, a) if a is not None else None)
-        flat = (rows.n, rows.mu, g.t1, g.t2, g.inv_mass_b, g.inv_mass_a, g.inertia_b, g.inertia_a, g.couples)
-        pair = _pair(rows, *cut(flat, 0), a, b)
-        slots = cut((rows.rb, rows.ra, rows.surface, g.mass_1, g.mass_2, law, lam), 1)
+        pair = _pair(rows, *cut(_of_pairs(g), 0), a, b)
+        slots = cut(_of_points(g, law, lam), 1)
         local, new = _slots(pair, slots, local, one, unroll=rows.slots * len(colours) <= UNROLL)
         body = _write(body, b, local[0])
         if a is not None:
@@ -354,9 +353,8 @@ def _sweep_colours(g: Group, law: Sweep, lam: Impulses, body, one):
         a = None if table_a is None else table_a[k]
         get = lambda i: jax.tree.map(lambda c: c[i], body)
         old = (get(b), None if a is None else get(a))
-        flat = (rows.n, rows.mu, g.t1, g.t2, g.inv_mass_b, g.inv_mass_a, g.inertia_b, g.inertia_a, g.couples)
-        pair = _pair(rows, *cut(flat, 0, k))
-        slots = cut((rows.rb, rows.ra, rows.surface, g.mass_1, g.mass_2, law, lam), 1, k)
+        pair = _pair(rows, *cut(_of_pairs(g), 0, k))
+        slots = cut(_of_points(g, law, lam), 1, k)
         new, part = _slots(pair, slots, old, one, unroll=False)
         add = lambda body, i, new, old: jax.tree.map(lambda c, p, q: c.at[i].add(p - q), body, new, old)
         body = add(body, b, new[0], old[0])
@@ -397,9 +395,8 @@ def _sweep_points(g: Group, law: Sweep, lam: Impulses, body, one):
         old = of_point(lam, pair, slot)
         local = [jax.tree.map(lambda c: at(c, end, 0), body) for end in ends]
         old, local = materialise((old, local), one)
-        flat = (rows.n, rows.mu, g.t1, g.t2, g.inv_mass_b, g.inv_mass_a, g.inertia_b, g.inertia_a, g.couples)
-        own = of_point((rows.rb, rows.ra, rows.surface, g.mass_1, g.mass_2, law), pair, slot)
-        new, l = _point(_pair(rows, *of_pair(flat, pair)), (*own, old), (*local, None)[:2], one)
+        own = of_point(_of_points(g, law), pair, slot)
+        new, l = _point(_pair(rows, *of_pair(_of_pairs(g), pair)), (*own, old), (*local, None)[:2], one)
         for end, values in zip(ends, new):
             body = jax.tree.map(lambda c, v: jax.lax.dynamic_update_slice_in_dim(c, v, end, axis=0), body, values)
         put = lambda c, v: jax.lax.dynamic_update_slice(c, v[None], (slot, pair, jnp.zeros_like(slot)))
@@ -409,6 +406,17 @@ def _sweep_points(g: Group, law: Sweep, lam: Impulses, body, one):
     body = jax.tree.map(lambda c: jnp.broadcast_to(c, (c.shape[0], worlds)), body)
     _, body, lam = jax.lax.while_loop(lambda c: c[0] < g.points.count, point, (jnp.int32(0), body, lam))
     return body, lam
+
+
+def _of_pairs(g: Group):
+    """What ``_pair`` takes of a group, leaves (P, B) or of one pair."""
+    rows = g.rows
+    return rows.n, rows.mu, g.t1, g.t2, g.inv_mass_b, g.inv_mass_a, g.inertia_b, g.inertia_a, g.couples
+
+
+def _of_points(g: Group, law: Sweep, *lam: Impulses):
+    """What ``_point`` takes of a group, leaves (S, P, B) or without a slot axis."""
+    return g.rows.rb, g.rows.ra, g.rows.surface, g.mass_1, g.mass_2, law, *lam
 
 
 def _pair(rows: Rows, n, mu, t1, t2, inv_mass_b, inv_mass_a, inertia_b, inertia_a, couples, a=None, b=None) -> Group:
@@ -555,9 +563,8 @@ def _sweep_chunks(g: Group, law: Sweep, lam: Impulses, body, one):
     pairs, worlds, n = *p.source.shape, body[0].x.shape[0]
     column = jnp.arange(worlds)[None, :]
     filled = p.source < p.place.shape[0]
-    flat = (rows.n, rows.mu, g.t1, g.t2, g.inv_mass_b, g.inv_mass_a, g.inertia_b, g.inertia_a, g.couples)
     lam = jax.tree.map(lambda c: jnp.broadcast_to(c, rows.phi.shape), lam)
-    slots = (rows.rb, rows.ra, rows.surface, g.mass_1, g.mass_2, law, lam)
+    slots = _of_points(g, law, lam)
 
     def run(body, start: int, width: int, active):
         """``width`` places at a time from ``start`` on; the impulses (S, places, B)."""
@@ -568,7 +575,7 @@ def _sweep_chunks(g: Group, law: Sweep, lam: Impulses, body, one):
             part = lambda tree: jax.tree.map(lambda c: cut(c) if jnp.ndim(c) and c.shape[-2] == pairs else c, tree)
             index = [cut(i) for i in (rows.b, rows.a) if i is not None]
             local = [take_tree(body, i) for i in index]
-            local, new = _slots(_pair(rows, *part(flat)), part(slots), (*local, None)[:2], one, rows.slots <= 2)
+            local, new = _slots(_pair(rows, *part(_of_pairs(g))), part(slots), (*local, None)[:2], one, rows.slots <= 2)
             for i, values in zip(index, local):
                 target = jnp.where(cut(filled), i, n)
                 body = jax.tree.map(lambda c, v: c.at[target, column].set(v, mode="drop"), body, values)
