@@ -46,22 +46,30 @@ def readable(size: float) -> str:
     return f"{size / 1000**power:.3g} {('bytes', 'kB', 'MB', 'GB', 'TB')[power]}"
 
 
-def available() -> int | None:
-    """Bytes that the default device has left; None where it does not say."""
-    device = jax.local_devices()[0]
-    if device.platform != "cpu":
-        stats = device.memory_stats() or {}
-        return stats["bytes_limit"] - stats["bytes_in_use"] if {"bytes_limit", "bytes_in_use"} <= set(stats) else None
+def available(devices=()) -> int | None:
+    """Bytes that ``devices`` (none: the default one) have left together; None where one does not say."""
+    devices = devices or jax.local_devices()[:1]
+    if devices[0].platform == "cpu":
+        return _of_machine()
+    left = [device.memory_stats() or {} for device in devices]
+    if not all({"bytes_limit", "bytes_in_use"} <= set(stats) for stats in left):
+        return None
+    return sum(stats["bytes_limit"] - stats["bytes_in_use"] for stats in left)
+
+
+def _of_machine(proc=pathlib.Path("/proc/meminfo"), group=pathlib.Path("/sys/fs/cgroup")) -> int | None:
+    """What the machine has left, and a container that has a limit of its own."""
     left = []
     try:
-        lines = pathlib.Path("/proc/meminfo").read_text().splitlines()
+        lines = proc.read_text().splitlines()
         left.append(next(1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable")))
     except (OSError, StopIteration, ValueError):
         pass
-    try:  # a container's own limit
-        group = pathlib.Path("/sys/fs/cgroup")
+    try:
         limit, used = (int((group / f"memory.{name}").read_text()) for name in ("max", "current"))
-        left.append(limit - used)
+        counts = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+        files = int(counts.get("inactive_file", 0))  # copies of files, which the kernel drops when memory is asked for
+        left.append(limit - used + files)
     except (OSError, ValueError):
         pass
     return min(left) if left else None
@@ -71,8 +79,8 @@ def bytes_of(tree) -> int:
     return sum(math.prod(c.shape) * c.dtype.itemsize for c in jax.tree.leaves(tree))
 
 
-def refuse(state: State, worlds: int, samples: int, copies: int) -> None:
-    """Raise where the samples of a rollout cannot fit.
+def refuse(state: State, worlds: int, samples: int, copies: int, devices=()) -> None:
+    """Raise where the samples of a rollout cannot fit into ``devices`` together (none: the default one).
 
     Raises:
       MemoryError: naming what is needed, what there is and what to change.
@@ -82,7 +90,7 @@ def refuse(state: State, worlds: int, samples: int, copies: int) -> None:
     need = worlds * samples * each * copies
     if need < SMALL:
         return
-    left = available()
+    left = available(devices)
     if left is not None and need > left:
         raise MemoryError(
             f"rollout: {samples:,} samples of {worlds:,} worlds need {readable(need)}, the device has {readable(left)} "

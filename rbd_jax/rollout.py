@@ -123,7 +123,7 @@ def rollout(
     steps, every, batch = int(steps), int(every), batch_of(model, state.batch_shape)
     core = _forward(steps, every)
     use = means(core, (model, state, control), batch, steps)
-    refuse(state, math.prod(batch), steps // every + 1, 1 + (use.cores > 1))
+    refuse(state, math.prod(batch), steps // every + 1, 1 + (use.cores > 1), use.devices)
     if use.devices:
         return over_devices(core, use.devices, model, state, control, batch, donate)
     if use.cores > 1:
