@@ -222,16 +222,18 @@ def _needs_attitude(r, groups, kinds, category, centred) -> bool:
 # --- pairs ---
 
 
-def _boxes_that_touch(r) -> tuple[int, float, float]:
-    """Number of bodies whose boxes may touch another body's, the smallest edge of these boxes [m], their mass ratio."""
+def _boxes_that_touch(r) -> tuple[int, float, float, bool]:
+    """Number of bodies whose boxes may touch another body's, the smallest edge of these boxes [m], their mass ratio,
+    and whether bodies touch each other with nothing but boxes."""
     box = np.array([s.kind == "box" for s in r.geom_shapes])
     moving = np.array(["dynamic", "kinematic", "static"])[r.geom_category] == "dynamic"
     geoms = np.unique(r.pairs[(box & moving)[r.pairs].all(axis=1)]) if len(r.pairs) else []
     if not len(geoms):
-        return 0, 1.0, 1.0
+        return 0, 1.0, 1.0, False
     bodies = np.unique(r.geom_body[geoms])
     size = 2.0 * min(min(r.geom_shapes[g].half_extents) for g in geoms)
-    return len(bodies), size, r.mass[bodies].max() / r.mass[bodies].min()
+    alone = box[r.pairs[moving[r.pairs].all(axis=1)]].all()
+    return len(bodies), size, r.mass[bodies].max() / r.mass[bodies].min(), bool(alone)
 
 
 def _groups(r, kinds, category, centred, method: Method, scene: Scene, dt: float) -> tuple[Group, ...]:

@@ -17,6 +17,7 @@ from .contact.broadphase import (
     all_pairs,
     at,
     below,
+    close,
     grid_pairs,
     half_widths,
     key_of,
@@ -24,12 +25,13 @@ from .contact.broadphase import (
     no_key,
     rows_of_key,
 )
+from .loops import each_pair
 from .model import Coefficient, Group, GroupParams, Params, Structure
 from .solvers.rows import Impulses, Index, Rows, take, take_tree
 from .spatial import Quat, Vec3, safe_norm
 from .state import World
 from .struct import struct
-from .xla import materialise, piece
+from .xla import in_one_function, materialise, piece
 
 
 @struct
@@ -170,8 +172,19 @@ def manifold(g: Group, selected: Selected, world: World, margin, one) -> Manifol
     n = selected.numbers
     pose_a = pose_of(world, side_of(g, "a"), selected.body_a, n.local_a)
     pose_b = pose_of(world, side_of(g, "b"), selected.body_b, n.local_b)
-    m = NARROW[g.kind].function(pose_a, pose_b, n.size_a, n.size_b, margin, one=one)
+    args = pose_a, pose_b, n.size_a, n.size_b, margin
+    function = NARROW[g.kind].function
+    if g.kind == ("box", "box") and g.choice is None and in_one_function() and isinstance(margin, jax.Array):
+        m = each_pair(lambda _, *args: function(*args, one=one), _near(*args).any(axis=-1), *args)
+    else:
+        m = function(*args, one=one)
     return m if selected.filled is None else m._with(live=m.live & selected.filled[None])
+
+
+def _near(a: Pose, b: Pose, size_a, size_b, margin) -> jax.Array:
+    """Whether the bounding boxes of two boxes, grown by ``margin``, overlap, (P, B)."""
+    grown = half_widths("box", size_a, a).map(lambda c: c + margin)
+    return close(Bounds(a.x, grown), Bounds(b.x, half_widths("box", size_b, b)), False)
 
 
 def rows_of(g: Group, selected: Selected, m: Manifold, world: World) -> Rows:

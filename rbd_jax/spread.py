@@ -61,7 +61,7 @@ def means(core, args, batch: tuple[int, ...], steps: int) -> Means:
     Several devices are used where JAX has them and the arrays are not committed to one of them.
     """
     use = _allowed(args, math.prod(batch), steps)
-    if use != Means() and on_cpu() and _waits(core, args):
+    if use != Means() and on_cpu() and _waits(core, args, tuple(batch), use):
         return Means()
     return use
 
@@ -74,10 +74,14 @@ def _key(core, args):
     return core, tree, tuple((jnp.shape(c), c.dtype) for c in leaves)
 
 
-def _waits(core, args) -> bool:
-    key = _key(core, args)
-    if key not in _waiting:
-        _waiting[key] = waits(jax.make_jaxpr(core)(*args).jaxpr)
+def _waits(core, args, batch, use: Means) -> bool:
+    key = _key(core, args), batch, use
+    if key not in _waiting:  # the trace is kept for the call
+        if use.devices:
+            traced = _sharded.trace(core, *args, _mesh(use.devices), batch)
+        else:
+            traced = _share.trace(core, *args, np.int32(0), batch, use.cores)
+        _waiting[key] = waits(traced.jaxpr.jaxpr)
     return _waiting[key]
 
 
@@ -167,6 +171,9 @@ _sharded_donated = jax.jit(_shard, static_argnums=(0, 4, 5), donate_argnums=(2,)
 
 def over_devices(core, devices, model: Model, state: State, wrench: Wrench | None, batch, donate: bool):
     """``core(model, state, wrench)`` with the batch sharded over ``devices``."""
-    mesh = jax.sharding.Mesh(np.array(devices), (AXIS,))
     call = _sharded_donated if donate else _sharded
-    return call(core, model, state, wrench, mesh, tuple(batch))
+    return call(core, model, state, wrench, _mesh(devices), tuple(batch))
+
+
+def _mesh(devices):
+    return jax.sharding.Mesh(np.array(devices), (AXIS,))

@@ -73,6 +73,11 @@ def in_one_function() -> bool:
     return _kind.get() == "one"
 
 
+def loops_are_cheap() -> bool:
+    """Whether what is being traced becomes one function, or its pieces do."""
+    return _kind.get() != "kernels"
+
+
 @contextlib.contextmanager
 def _traced_as(kind: str):
     token = _kind.set(kind)
@@ -95,15 +100,21 @@ def one_function(run, longest: int | None = None):
     def call(*args):
         if not on_cpu():
             return run(*args)
-        # XLA's emitter of such functions cannot pass an argument by that nothing in them uses, so all are results too.
-        inner = jax.jit(lambda *args: (run(*args), args))
         with _traced_as("one"):
-            length = _length(jax.make_jaxpr(inner)(*args).jaxpr)
-            fits = length is not None and (longest is None or length <= longest)
-            out = inner(*args) if fits else None
-        if fits:
+            traced, shape = jax.make_jaxpr(run, return_shape=True)(*args)
+        length = _length(traced.jaxpr)
+        if length is not None and (longest is None or length <= longest):
+            leaves, out = [*traced.consts, *jax.tree.leaves(args)], jax.tree.structure(shape)
+            count = len(traced.consts)
+
+            def inner(*leaves):
+                # XLA's emitter of such functions cannot pass an argument by that nothing in them uses: all are results
+                return jax.core.eval_jaxpr(traced.jaxpr, leaves[:count], *leaves[count:]), leaves
+
+            inner.__name__ = getattr(getattr(run, "func", run), "__name__", "run")  # its name in profiles
             # XLA's own mark of a call that its CPU backend emits as one function; it sets it on tiny loops itself.
-            return set_xla_metadata(out, xla_cpu_small_call="true", inlineable="false")[0]
+            marked = set_xla_metadata(jax.jit(inner)(*leaves), xla_cpu_small_call="true", inlineable="false")
+            return out.unflatten(marked[0])
         if longest is None:
             return run(*args)
         with _traced_as("pieces"):

@@ -11,6 +11,7 @@ LAYER = {
     "status": 0,
     "spatial": 1,
     "xla": 1,
+    "loops": 1,
     "implicit": 1,
     "bodies": 2,
     "shapes": 2,

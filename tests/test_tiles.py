@@ -70,7 +70,8 @@ def test_bits_do_not_depend_on_batch_size_nor_on_cores(worlds):
     name, model, state = worlds
     rbd.use_cores(1)
     final, traj = run(model, state)
-    assert np.isfinite(np.asarray(final.pos)).all() and not np.asarray(final.status).any()
+    assert np.isfinite(np.asarray(final.pos)).all()
+    assert not (np.asarray(final.status) & ~np.uint32(rbd.Status.NOT_CONVERGED)).any()
     for size in (32, 45, 128, 129):
         few, samples = run(model, cut(state, size))
         assert same(few, cut(final, size)), f"{name}: {size} worlds differ from the first of 300"

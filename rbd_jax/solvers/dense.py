@@ -22,7 +22,7 @@ import numpy as np
 
 from ..spatial import Mat3, Vec3, components
 from ..struct import static, struct
-from ..xla import materialise
+from ..xla import materialise, summed
 from .base import Problem
 from .rows import Impulses, Index, Rows, add_rows, take, take_tree
 
@@ -147,35 +147,44 @@ def row_dot(p: Impulses, u: Impulses) -> jax.Array:
     return _add(p.n * u.n, _mul(p.t1, u.t1), _mul(p.t2, u.t2), _mul(p.s, u.s), _mul(p.r1, u.r1), _mul(p.r2, u.r2))
 
 
+def ends(c: Contacts, v: Vec3, w: Vec3 | None) -> list:
+    """(v, w) of body B of every pair, and of body A where there is one, (P, B)."""
+    return [(take_tree(v, i), None if w is None else take_tree(w, i)) for i in (c.b, c.a) if i is not None]
+
+
 def at_points(c: Contacts, v: Vec3, w: Vec3 | None) -> Impulses:
     """Relative velocity J (v, w) of every slot; v, w are body velocities (n, B)."""
+    return between(c, ends(c, v, w))
 
-    def side(index, r):
-        u = c.turn(take_tree(v, index))
+
+def between(c: Contacts, bodies) -> Impulses:
+    """Relative velocity of every slot, of the velocities of ``ends``."""
+
+    def side(body, r):
+        u = c.turn(body[0])
         if r is None:
             return u
-        s = c.turn(take_tree(w, index))
+        s = c.turn(body[1])
         z = u.z + (s.x * r.y - s.y * r.x)
         if not c.friction:
             return Vec3(None, None, z)
         return Vec3(u.x + (s.y * r.z - s.z * r.y), u.y + (s.z * r.x - s.x * r.z), z)
 
-    u = side(c.b, c.rb)
-    if c.a is not None:
-        ua = side(c.a, c.ra)
+    u = side(bodies[0], c.rb)
+    if len(bodies) > 1:
+        ua = side(bodies[1], c.ra)
         u = Vec3(*(None if p is None else p - q for p, q in zip((u.x, u.y, u.z), (ua.x, ua.y, ua.z))))
     full = lambda x: jnp.broadcast_to(x, jnp.broadcast_shapes(x.shape, c.live.shape))
     if not c.friction:
         return Impulses(full(u.z))
-    return Impulses(full(u.z), full(u.x), full(u.y), *map(full, _angular(c, _relative_spin(c, w))))
+    return Impulses(full(u.z), full(u.x), full(u.y), *map(full, _angular(c, _relative_spin(c, bodies))))
 
 
-def _relative_spin(c: Contacts, w: Vec3 | None) -> Vec3 | None:
+def _relative_spin(c: Contacts, bodies) -> Vec3 | None:
     """wB - wA of every pair, (P, B) world axes; None where no row needs it."""
     if not c.torsion:
         return None
-    spin = take_tree(w, c.b)
-    return spin if c.a is None else spin - take_tree(w, c.a)
+    return bodies[0][1] if len(bodies) == 1 else bodies[0][1] - bodies[1][1]
 
 
 def _angular(c: Contacts, spin: Vec3 | None) -> tuple:
@@ -202,24 +211,32 @@ def on_bodies(cs, ps, problem: Problem) -> tuple[Vec3, Vec3 | None]:
     force = Vec3(zero, zero, zero)
     torque = None if problem.w is None else force
     for c, p in zip(cs, ps):
-        total = p.n.sum(0)
-        world = c.n * total
-        if c.friction:
-            world = world + c.t1 * p.t1.sum(0) + c.t2 * p.t2.sum(0)
-        for index, r, sign in ((c.b, c.rb, 1.0), (c.a, c.ra, -1.0)):
-            if index is None:
-                continue
+        world, turns = on_pair(c, p)
+        for index, turn, sign in zip((c.b, c.a), turns, (1.0, -1.0)):
             force = _scatter(force, index, world * sign)
-            if r is None:
-                continue
-            x, y = r.y * p.n, -r.x * p.n
-            if c.friction:
-                x, y = x - r.z * p.t2, y + r.z * p.t1
-            turn = c.t1 * _add(x, p.r1).sum(0) + c.t2 * _add(y, p.r2).sum(0)
-            if c.friction:
-                turn = turn + c.n * _add(r.x * p.t2 - r.y * p.t1, p.s).sum(0)
-            torque = _scatter(torque, index, turn * sign)
+            if turn is not None:
+                torque = _scatter(torque, index, turn * sign)
     return force, torque
+
+
+def on_pair(c: Contacts, p: Impulses) -> tuple[Vec3, list]:
+    """Impulse on body B of every pair, and the angular impulses [on B, minus that on A] (None: no arm), (P, B)."""
+    world = c.n * summed(p.n)
+    if c.friction:
+        world = world + c.t1 * summed(p.t1) + c.t2 * summed(p.t2)
+    turns = []
+    for r in (c.rb,) if c.a is None else (c.rb, c.ra):
+        if r is None:
+            turns.append(None)
+            continue
+        x, y = r.y * p.n, -r.x * p.n
+        if c.friction:
+            x, y = x - r.z * p.t2, y + r.z * p.t1
+        turn = c.t1 * summed(_add(x, p.r1)) + c.t2 * summed(_add(y, p.r2))
+        if c.friction:
+            turn = turn + c.n * summed(_add(r.x * p.t2 - r.y * p.t1, p.s))
+        turns.append(turn)
+    return world, turns
 
 
 def response(problem: Problem, impulse: Vec3, turn: Vec3 | None) -> tuple[Vec3, Vec3 | None]:
@@ -405,12 +422,12 @@ def _assemble(k, c, w, size: int, upper=None):
 def _diagonal_blocks(c: Contacts, g: Sym3 | Sym6, r: Vec3 | None, one):
     """K, C, W of one body of every pair, world axes, entries (P, B)."""
     if c.t1 is None:  # no tangents at all: K = G n n'
-        gn = materialise(g.zz.sum(0), one)
+        gn = materialise(summed(g.zz), one)
         n = components(c.n)
         return [[n[i] * n[j] * gn for j in range(3)] for i in range(3)], None, None
     m = _full(g)
     cross = g.cross if isinstance(g, Sym6) else UNCOUPLED
-    k = _rotate(c, materialise([[None if x is None else x.sum(0) for x in row] for row in m], one), one)
+    k = _rotate(c, materialise([[_slots(x) for x in row] for row in m], one), one)
     if r is None:
         return k, None, None
     torque = [_cross(r, [m[i][j] for i in range(3)]) for j in range(3)]  # columns of [r]x F
@@ -433,7 +450,7 @@ def _torque_spin(c: Contacts, g: Sym3 | Sym6, ra: Vec3, rb: Vec3, one):
 
 
 def _slots(x):
-    return None if x is None else x.sum(0)
+    return None if x is None else summed(x)
 
 
 UNCOUPLED = ((None,) * 3,) * 3

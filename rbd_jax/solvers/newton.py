@@ -43,6 +43,7 @@ system, no stored iterates, exact where a world is not ``unconverged``; first an
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -50,8 +51,8 @@ import numpy as np
 
 from .. import implicit
 from ..struct import struct
-from ..xla import materialise, materialise_linear
-from . import dense
+from ..xla import loops_are_cheap, materialise, materialise_linear, piece
+from . import dense, newton_loop
 from .base import Problem, Solution, Solver
 from .dense import Contacts, Lagging, Sym3, Sym6
 from .laws import Law, contact_model
@@ -103,6 +104,8 @@ class NewtonLagged(Solver):
         closed = _single_sphere(problem)
         if closed and not self.smoothing:
             return self._closed_form(problem)
+        if self._loops(problem):
+            return self._in_loops(problem)
         system, start = self._system(problem)
         if self.smoothing == "backward":
             soft, system = system, system._with(smooth=None)
@@ -119,6 +122,28 @@ class NewtonLagged(Solver):
             unconverged=None if bound is None else self._unconverged(system, bound, p),
             warm=not closed,
         )
+
+    def _loops(self, problem: Problem) -> bool:
+        """Whether pairs are gone through one by one, until a world is solved."""
+        plain = all(isinstance(rows.b, Index) and rows.mu_spin is None for rows in problem.rows)
+        return loops_are_cheap() and plain and not self.polish
+
+    def _in_loops(self, problem: Problem) -> Solution:
+        bare = problem._with(rows=(), warm=())
+        run = piece(functools.partial(newton_loop.group, self._of_group))
+        # what a group does not need must not be among the arguments of its function
+        needs = bare._with(q=None, inertia=None)
+        still = needs._with(v0=None, w0=None)
+        args = zip((rows._with(feature=None) for rows in problem.rows), problem.warm)
+        found = [run(rows, warm, still if rows.e is None else needs) for rows, warm in args]
+        p, impulse, turn, wrong = newton_loop.solve(self, *zip(*found), bare)
+        return Solution(impulse=impulse, angular_impulse=turn, contacts=p, unconverged=wrong)
+
+    def _of_group(self, rows: Rows, warm: Impulses, problem: Problem):
+        c = dense.contacts(rows, problem)
+        free = dense.relative(c, rows, problem.v, problem.w)
+        law = self._law(c, rows, problem, self.event_beta)
+        return c, law, free, _start(c, warm), _bound(law, warm.n, free)
 
     def _system(self, problem: Problem):
         """What the rows depend on, and the impulses and bounds of friction to start from."""
@@ -261,6 +286,18 @@ class NewtonLagged(Solver):
         if self.polish:  # implicit derivatives are as wrong as the residual is large
             return worst > jnp.finfo(worst.dtype).eps ** 0.5 * (scale + self.slip_speed)
         return worst > self.tolerance * scale + self.slip_speed
+
+    def mismatch(self, c: Contacts, law: _Law, p: Impulses, u: Impulses, bound, free: Impulses):
+        """Of every row: the velocity that it lacks, its residual as a velocity, its fastest velocity [m/s]."""
+        normal = jnp.abs(law.w * p.n - jnp.maximum(law.w * p.n - u.n - law.r * p.n, 0.0))
+        speed = jnp.maximum(jnp.abs(free.n + law.vhat), jnp.abs(law.vhat))
+        if not c.friction:
+            return normal, normal, speed
+        limit, eps = self._friction(law, None, bound)
+        drag = limit * _inverse_speed(u.t1, u.t2, eps)
+        slip = law.w * jnp.maximum(jnp.abs(p.t1 + drag * u.t1), jnp.abs(p.t2 + drag * u.t2))
+        speed = jnp.maximum(speed, jnp.maximum(jnp.abs(free.t1), jnp.abs(free.t2)))
+        return jnp.maximum(normal, slip / (1.0 + law.w * drag)), jnp.maximum(normal, slip), speed
 
     def _violation(self, system: _System, bounds, ps):
         """Largest residual of a row of a world, as a velocity [m/s] (B,), and the fastest relative velocity."""

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from ...struct import struct
+from ...xla import summed
 from ..rows import Rows
 
 #: Bodies that start in overlap part at up to this many times a model's ``push_speed``: a contact alone gives
@@ -69,7 +70,7 @@ def spring_energy(stiffness, overlap: jax.Array) -> jax.Array:
 
 def points(rows: Rows, dtype) -> jax.Array:
     """Number of live points of every pair, at least 1: they share its load. (P, B)."""
-    return jnp.maximum(rows.live.sum(0), 1).astype(dtype)
+    return jnp.maximum(summed(rows.live.astype(dtype)), 1)
 
 
 def recovery(phi: jax.Array, problem, fraction, push_speed: float) -> jax.Array:
