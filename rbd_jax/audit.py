@@ -13,7 +13,7 @@ from .rollout import _batched_call, _check_state, _check_wrench, _hot_wrench, _s
 from .solvers import dense
 from .solvers.residuals import WORST, nothing, residuals
 from .state import State, World, Wrench, to_public
-from .step import FROZEN, _problem, enter, leave, watched, with_memory
+from .step import FROZEN, _problem, enter, leave, spins, watched, with_memory
 from .struct import struct
 
 
@@ -156,7 +156,7 @@ def _overlap(model: Model, p: Params, world: World):
     zero = jnp.zeros(world.step.shape, bodies.x.x.dtype)
     deepest, depth, count, stored = zero, zero, zero, None
     contacts = detect(model.structure, p, world, contact.reach) if model.structure.groups else ()
-    problem = _problem(p, bodies, bodies.v, bodies.L, contacts) if contacts else None
+    problem = _problem(p, bodies, bodies.v, spins(p, bodies, bodies.L), contacts) if contacts else None
     for c in contacts:
         rows = c.rows
         over = jnp.where(rows.live & (rows.phi < 0), -rows.phi, 0.0)

@@ -55,7 +55,7 @@ def detect(s: Structure, p: Params, world: World, reach_of_model: str) -> tuple[
     "all": every slot, however far (a distant row does nothing); "step": those that may touch
     within the step; "margin": those that touch, or are closer than MuJoCo's margin.
     """
-    reach = _reach(p, world) if reach_of_model == "step" or any(g.capacity for g in s.groups) else None
+    reach = piece(_reach)(p, world) if reach_of_model == "step" or any(g.capacity for g in s.groups) else None
     return tuple(_group(g, gp, p, world, i, reach, reach_of_model) for i, (g, gp) in enumerate(zip(s.groups, p.groups)))
 
 
@@ -178,6 +178,8 @@ def manifold(g: Group, selected: Selected, world: World, margin, one) -> Manifol
         m = each_pair(lambda _, *args: function(*args, one=one), _near(*args).any(axis=-1), *args)
     else:
         m = function(*args, one=one)
+    if g.features:  # that of what does not touch must not depend on other worlds, which decide what is looked at
+        m = m._with(feature=jnp.where(m.live.any(axis=0), m.feature, 0))
     return m if selected.filled is None else m._with(live=m.live & selected.filled[None])
 
 
@@ -234,19 +236,21 @@ def _group(g: Group, gp: GroupParams, p: Params, world: World, number: int, reac
     if gp.law is not None:
         margin = selected.numbers.law.margin
     if reach_of_model == "step" or (reach_of_model == "all" and g.capacity is not None):
-        margin = SLOP * min_size(g.kind, selected.numbers.size_a, selected.numbers.size_b) + sum(
-            take(reach, i)
-            for c, i in ((side_of(g, "a"), selected.body_a), (side_of(g, "b"), selected.body_b))
-            if c == "dynamic"
-        )
+        sides = ((side_of(g, "a"), selected.body_a), (side_of(g, "b"), selected.body_b))
+        reaches = [take(reach, i) for c, i in sides if c == "dynamic"]
+        least = min_size(g.kind, selected.numbers.size_a, selected.numbers.size_b)
+        margin = piece(lambda least, reaches: SLOP * least + sum(reaches))(least, reaches)
         if g.choice is not None and g.category == "kinematic":
             margin = margin + take(_sweep_of(p, world), selected.body_b if g.flip else selected.body_a)
-    m = piece(lambda *args: manifold(g, *args))(selected, world, margin, p.one)
+    if isinstance(margin, float):  # none, as the number that the narrow phase knows it by
+        m = piece(lambda selected, world, one: manifold(g, selected, world, margin, one))(selected, world, p.one)
+    else:
+        m = piece(lambda *args: manifold(g, *args))(selected, world, margin, p.one)
     if g.choice is not None:  # the solver gathers from the rows: not the narrow phase again for each of them
         m = m._with(**materialise(dict(normal=m.normal, point=m.point, distance=m.distance), p.one))
     if g.padding is not None:
         m = m._with(live=m.live & ~g.padding[:, None])
-    rows = rows_of(g, selected, m, world)
+    rows = piece(lambda *args: rows_of(g, *args))(selected, m, world)
     last = _last(g, world, number, pairs, rows.feature)
     again = m.live & (last.n > 0)  # negative: an impact
     warm = jax.tree.map(lambda c: jnp.where(again, c, 0.0), last)

@@ -23,11 +23,11 @@ from .model import Model, Params, params
 from .solvers.base import Problem, Solution
 from .solvers.restitution import normal_velocity, targets
 from .solvers.rows import Impulses, Rows, add_rows, inverse_inertia, spread, take, take_tree
-from .spatial import Vec3, components, where, zeros_like
+from .spatial import Quat, Vec3, components, where, zeros_like
 from .state import Memory, State, World, Wrench, to_hot, to_public
 from .status import Status
 from .struct import struct
-from .xla import materialise, opaque_one, summed
+from .xla import materialise, opaque_one, piece, summed
 
 FROZEN = int(Status.NOT_FINITE)
 
@@ -188,8 +188,8 @@ def enter(model: Model, state: State, batch: tuple[int, ...]) -> tuple[Params, W
     if s.attitude:
         q = hot.q if p.principal is None else hot.q @ p.principal
         if memory.L is not None:  # else I omega would differ from L by more than rounding after many single steps
-            q = q.normalised()
-        L = p.inertia.momentum(q, hot.w)
+            q = piece(Quat.normalised)(q)
+        L = piece(lambda inertia, q, w: inertia.momentum(q, w))(p.inertia, q, hot.w)
         if memory.L is not None:
             L = _exactly(L, memory.L)
         R = memory.R
@@ -212,7 +212,7 @@ def leave(model: Model, p: Params, world: World, batch: tuple[int, ...] | None, 
         quat, spin = world.quat, world.spin
     else:
         quat = bodies.q if p.principal is None else bodies.q @ p.principal.conj()
-        spin = _angular_velocity(p, bodies)
+        spin = piece(_angular_velocity)(p, bodies)
     dt = jnp.broadcast_to(p.h * model.method.substeps, world.step.shape)
     L = None if model.structure.isotropic else bodies.L
     kept = Memory(L, bodies.R, world.contacts, world.feature, world.pairs) if memory else None
@@ -309,7 +309,7 @@ def held(step, p: Params, world: World, wrench, *others):
     @jax.custom_jvp
     def call(p, world, wrench, *others):
         new, seen = step(p, world, wrench, *others)
-        return _freeze(world, new, p)[0], seen
+        return piece(_freeze)(world, new, p)[0], seen
 
     def rule(primals, tangents):
         p, world, *_ = primals
@@ -424,14 +424,36 @@ def _solved(model: Model, p: Params, world: World, wrench: Wrench | None):
             rows=c.rows if c.rows.e is None or c.pairs is not None else c.rows._with(meets=meets),
         )
         contacts = tuple(rest(c, meets) for c, meets in zip(contacts, more))
-    a, tau = acceleration(p, wrench, old)
-    v, L = integrator.kick(old, a, tau, p.inertia, p.h)
-    problem = _problem(p, old, v, L, contacts)._with(
+    predict = lambda *args: _predicted(integrator, *args)
+    v, L, *turning = piece(predict)(p, wrench, old)
+    problem = _problem(p, old, v, turning, contacts)._with(
         contact=model.method.contact, nominal=nominal, smoothing=p.smoothing
     )
     solution = model.method.solver.solve(problem)
     if any(rows.e is not None and rows.slots > 1 for rows in problem.rows):
         solution = _passive(p, problem, solution)
+    finish = lambda *args: _moved(integrator, *args)
+    return piece(finish)(p, world, L, problem, contacts, solution), problem, solution
+
+
+def _predicted(integrator, p: Params, wrench: Wrench | None, old: Bodies):
+    """Velocity and angular momentum without contact, inverse inertia, spin at the start and without contact."""
+    a, tau = acceleration(p, wrench, old)
+    v, L = integrator.kick(old, a, tau, p.inertia, p.h)
+    return v, L, *spins(p, old, L)
+
+
+def spins(p: Params, old: Bodies, L: Vec3 | None):
+    """World inverse inertia, spin at the start and with the angular momentum L; None without attitude."""
+    if L is None:
+        return None, None, None
+    inverse = materialise(inverse_inertia(p.inertia, old.q), p.one)
+    return inverse, inverse @ old.L, inverse @ L
+
+
+def _moved(integrator, p: Params, world: World, L, problem: Problem, contacts, solution: Solution) -> World:
+    """The world after the contact impulses."""
+    old, v = world.bodies, problem.v
     v1 = v + solution.impulse * p.inv_mass
     L1 = L if solution.angular_impulse is None else L + solution.angular_impulse
     if solution.warm:
@@ -455,7 +477,7 @@ def _solved(model: Model, p: Params, world: World, wrench: Wrench | None):
     if impacts is not None:
         x = x + impacts.shift
     bodies = bodies._with(x=x, v=v1, L=L1)
-    return _remember(world, bodies, p, contacts, solution, problem), problem, solution
+    return _remember(world, bodies, p, contacts, solution, problem)
 
 
 def _to_impacts(model: Model, p: Params, world: World, wrench: Wrench | None):
@@ -480,11 +502,8 @@ def _to_impacts(model: Model, p: Params, world: World, wrench: Wrench | None):
     return advance_to_impacts(model, p, world, tuple(selected), *forces, (support, turn))
 
 
-def _problem(p: Params, old: Bodies, v: Vec3, L: Vec3 | None, contacts) -> Problem:
-    w0 = w = inverse = None
-    if L is not None:
-        inverse = materialise(inverse_inertia(p.inertia, old.q), p.one)
-        w0, w = inverse @ old.L, inverse @ L
+def _problem(p: Params, old: Bodies, v: Vec3, turning, contacts) -> Problem:
+    inverse, w0, w = turning  # as of ``spins``
     return Problem(
         rows=tuple(c.rows for c in contacts),
         v0=old.v,
@@ -551,7 +570,7 @@ def _force_step(model: Model, p: Params, world: World, wrench: Wrench | None):
         contacts = detect(s, p, world._with(bodies=bodies), model.method.reach)
         a, tau = acceleration(p, wrench, bodies)
         v, L = bodies.v if a is None else bodies.v + a * p.h, bodies.L
-        problem = _problem(p, bodies, v, L, contacts)
+        problem = _problem(p, bodies, v, spins(p, bodies, L), contacts)
         if L is not None:
             # w at constant inertia: gyroscopic and applied torque at the start of the step
             w0 = problem.w0

@@ -15,6 +15,7 @@ import contextvars
 import jax
 import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
+from jax.interpreters.partial_eval import dce_jaxpr
 
 
 def opaque_one(x: jax.Array) -> jax.Array:
@@ -104,17 +105,18 @@ def one_function(run, longest: int | None = None):
             traced, shape = jax.make_jaxpr(run, return_shape=True)(*args)
         length = _length(traced.jaxpr)
         if length is not None and (longest is None or length <= longest):
-            leaves, out = [*traced.consts, *jax.tree.leaves(args)], jax.tree.structure(shape)
-            count = len(traced.consts)
+            # XLA's emitter of such functions cannot pass an argument by that nothing in them uses: there are none but
+            # those that are used, and as XLA may find more than JAX to be of no use, all are results too
+            short, used = dce_jaxpr(traced.jaxpr, [True] * len(traced.jaxpr.outvars))
+            leaves = [c for c, u in zip(jax.tree.leaves(args), used, strict=True) if u]
 
             def inner(*leaves):
-                # XLA's emitter of such functions cannot pass an argument by that nothing in them uses: all are results
-                return jax.core.eval_jaxpr(traced.jaxpr, leaves[:count], *leaves[count:]), leaves
+                return jax.core.eval_jaxpr(short, traced.consts, *leaves), leaves
 
             inner.__name__ = getattr(getattr(run, "func", run), "__name__", "run")  # its name in profiles
             # XLA's own mark of a call that its CPU backend emits as one function; it sets it on tiny loops itself.
             marked = set_xla_metadata(jax.jit(inner)(*leaves), xla_cpu_small_call="true", inlineable="false")
-            return out.unflatten(marked[0])
+            return jax.tree.structure(shape).unflatten(marked[0])
         if longest is None:
             return run(*args)
         with _traced_as("pieces"):

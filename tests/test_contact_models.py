@@ -107,20 +107,20 @@ def test_combinations_that_do_not_exist_are_refused(method, message):
 
 
 def test_fast_picks_the_cheapest_solver_that_stands():
-    """Sweeps for bodies on the ground and small stacks in small steps, else a direct solve."""
+    """Sweeps for bodies on the ground and mixed scenes in small steps, a direct solve for boxes on boxes."""
 
-    def solver(n, dt, half=0.5, heavy=1.0):
+    def solver(n, dt, half=0.5, heavy=1.0, balls=0):
         box = lambda i: rbd.Body(
             f"b{i}", rbd.Box((half, half, half)), pos=(0, 0, half * (2 * i + 1)), mass=heavy if i else 1.0
         )
-        scene = rbd.Scene([box(i) for i in range(n)], [rbd.Geom(rbd.Plane())])
+        ball = lambda i: rbd.Body(f"s{i}", rbd.Sphere(half), pos=(3 * half * (i + 1), 0, half))
+        bodies = [box(i) for i in range(n)] + [ball(i) for i in range(balls)]
+        scene = rbd.Scene(bodies, [rbd.Geom(rbd.Plane())])
         return rbd.build(scene, dt=dt, method="fast")[0].method.solver.name
 
-    assert [solver(1, 1 / 60), solver(5, 1 / 240), solver(10, 1 / 60), solver(2, 1 / 500, heavy=100.0)] == [
-        "tgs",
-        "tgs",
-        "newton_lagged",
-        "newton_lagged",
-    ]
+    assert [solver(1, 1 / 60), solver(3, 1 / 240, balls=2), solver(0, 1 / 240, balls=3)] == ["tgs"] * 3
+    direct = [solver(5, 1 / 240), solver(10, 1 / 60), solver(3, 1 / 60, balls=2), solver(2, 1 / 500, heavy=100.0)]
+    assert direct == ["newton_lagged"] * 4
+    assert solver(65, 1 / 240) == "tgs", "too many for one system"
     chosen = rbd.build(resting(), dt=1 / 60, method=dataclasses.replace(rbd.PRESETS["fast"], substeps=3))[0].method
     assert (chosen.solver.name, chosen.substeps) == ("tgs", 3)

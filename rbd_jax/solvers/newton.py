@@ -135,7 +135,8 @@ class NewtonLagged(Solver):
         needs = bare._with(q=None, inertia=None)
         still = needs._with(v0=None, w0=None)
         args = zip((rows._with(feature=None) for rows in problem.rows), problem.warm)
-        found = [run(rows, warm, still if rows.e is None else needs) for rows, warm in args]
+        slow = lambda rows: rows.e is None and rows.law is None
+        found = [run(rows, warm, still if slow(rows) else needs) for rows, warm in args]
         p, impulse, turn, wrong = newton_loop.solve(self, *zip(*found), bare)
         return Solution(impulse=impulse, angular_impulse=turn, contacts=p, unconverged=wrong)
 

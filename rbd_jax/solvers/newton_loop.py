@@ -105,7 +105,7 @@ def solve(solver, groups, p, bound, problem: Problem):
       (p, impulse, angular impulse of every body, whether a world is unconverged).
     """
     one, worlds = problem.one, problem.v.x.shape[-1]
-    own, half = own_blocks(problem), max(1, solver.iterations // 2)
+    own, half = piece(own_blocks)(problem), max(1, solver.iterations // 2)
     full = lambda c: jnp.broadcast_to(c, (*c.shape[:-1], worlds))
     p, bound = jax.tree.map(full, (p, bound))
     zero = jnp.zeros(worlds, own.dtype)
@@ -120,13 +120,16 @@ def solve(solver, groups, p, bound, problem: Problem):
         total = nothing(own)
         for g, q in zip(groups, p):
             total = on(totals, g, q, total)
-        motion = materialise(dense.response(problem, *vectors(total)), one)
+        motion = piece(response)(problem, total)
         worst = (zero, zero, zero)
         for g, q, b in zip(groups, p, bound):
             worst = on(violation, g, q, b, motion, worst)
-        lacks, rest, scale = worst
-        wrong = rest > solver.tolerance * scale + solver.slip_speed
-        done = done | (lacks <= settled * scale)
+        verdict = lambda lacks, rest, scale: (
+            rest > solver.tolerance * scale + solver.slip_speed,
+            lacks <= settled * scale,
+        )
+        wrong, solved = piece(verdict)(*worst)
+        done = done | solved
         more = (k < solver.iterations) & ~done.all()
 
         def newton(carry):
@@ -149,6 +152,11 @@ def solve(solver, groups, p, bound, problem: Problem):
     start = (jnp.int32(0), p, bound, nothing(own), never, never, jnp.asarray(True), below)
     _, p, _, total, _, wrong, *_ = jax.lax.while_loop(lambda carry: carry[6], step, start)
     return p, *vectors(total), wrong
+
+
+def response(problem: Problem, total):
+    """Velocity changes of impulses ``total`` (n, m, B)."""
+    return materialise(dense.response(problem, *vectors(total)), problem.one)
 
 
 def vectors(c) -> tuple[Vec3, Vec3 | None]:

@@ -75,6 +75,7 @@ def points(rows: Rows, dtype) -> jax.Array:
 
 def recovery(phi: jax.Array, problem, fraction, push_speed: float) -> jax.Array:
     """Target velocity: a gap may close exactly; a ``fraction`` of an overlap is taken back a step [m/s]."""
-    gap = -phi / problem.h
-    back = gap if problem.nominal is None else -phi / problem.nominal
+    # products with the reciprocal, as XLA makes them of a quotient in one program and not in another
+    gap = -phi * (1.0 / problem.h)
+    back = gap if problem.nominal is None else -phi * (1.0 / problem.nominal)
     return jnp.where(phi <= 0, jnp.minimum(fraction * back, push_speed), gap)
