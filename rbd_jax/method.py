@@ -6,7 +6,7 @@ import dataclasses
 import math
 
 from .integrators import Integrator, Splitting, make as make_integrator
-from .solvers import CONTACT_MODELS, SOLVERS, TGS, ContactModel, NewtonLagged, Soft, Solver
+from .solvers import CONTACT_MODELS, SOLVERS, TGS, ContactModel, NewtonLagged, Solver
 
 #: Longest substep of ``substeps=None`` with a solver that is better split than solved harder [s].
 SUBSTEP = 1.0 / 240.0
@@ -18,8 +18,6 @@ RATIO = 10.0
 DIRECT = 64
 #: Sweeps of so many boxes less one; with two, a stack of four or five rocks at 0.1 m/s for seconds.
 MOST_SWEEPS = 4
-#: Stiffness of soft contact where no boxes may touch each other: less overlap than MuJoCo's default contact has.
-STIFF = 0.75
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,10 +30,10 @@ class Method:
         "spring", "mujoco") or an instance; None: the solver's own.
       solver: a name of ``rbd_jax.SOLVERS`` ("tgs", "pgs", "newton_lagged", "newton_cone", "penalty", "mujoco") or an
         instance. Any goes with any model, but "mujoco", which speaks its own only. None: the cheapest that stands:
-        "newton_lagged" with up to twelve Newton steps where 2 to 64 boxes may touch each other and bodies may touch
+        "newton_lagged" with up to eight Newton steps where 2 to 64 boxes may touch each other and bodies may touch
         each other with nothing else, or where sweeps would need substeps for these boxes, which is where
         dt > 1/240 s min(1, 8 / boxes) min(1, sqrt(size / 0.2 m)) or where their masses differ by more than 10 : 1; else
-        "tgs", with two to four sweeps for three to five and more boxes, and stiffer contact for less than two.
+        "tgs", with two to four sweeps for three to five and more boxes.
       substeps: steps inside a step of dt; None: 1, or for "tgs" and "penalty" as many as keep a substep within
         1/240 s at the dt of ``build``.
       events: with pairs that mention restitution, impacts a world may have in a (sub)step at their own instant, with
@@ -83,22 +81,20 @@ class Method:
         if integrator == "scene":
             integrator = "mujoco_" + (scene_integrator or "euler")
         integrator = make_integrator(integrator)
-        solver, contact = self.solver, self.contact
+        solver = self.solver
         if solver is None:
             longest = SUBSTEP * min(1.0, STACK / max(boxes, 1)) * min(1.0, math.sqrt(size / STACK_SIZE))
             direct = 2 <= boxes <= DIRECT and (alone or dt > longest or ratio > RATIO)
             solver = TGS(sweeps=min(max(boxes - 1, 2), MOST_SWEEPS))
             if direct and self.contact in (None, "near_rigid"):
-                solver = NewtonLagged(iterations=12)
-            elif boxes < 2 and contact is None:  # nothing to stack: stiffer than sweeps could carry a stack
-                contact = Soft(stiffness=STIFF)
+                solver = NewtonLagged(iterations=8)
         if isinstance(solver, str):
             if solver not in SOLVERS:
                 raise ValueError(f"Method: unknown solver '{solver}'; known: {', '.join(SOLVERS)}")
             solver = SOLVERS[solver]()
         if not isinstance(solver, Solver):
             raise ValueError(f"Method: solver = {solver!r} must be a name or a Solver")
-        contact = contact or solver.contact
+        contact = self.contact or solver.contact
         if isinstance(contact, str):
             if contact not in CONTACT_MODELS:
                 raise ValueError(f"Method: unknown contact model '{contact}'; known: {', '.join(CONTACT_MODELS)}")

@@ -1,7 +1,7 @@
 """Layer 5: contact solvers by name."""
 
 from .base import Problem, Solution, Solver
-from .laws import CONTACT_MODELS, ContactModel, Soft
+from .laws import CONTACT_MODELS, ContactModel
 from .mujoco import MujocoNewton
 from .newton import NewtonLagged
 from .newton_cone import NewtonCone
@@ -24,7 +24,6 @@ __all__ = [
     "Problem",
     "Rows",
     "SOLVERS",
-    "Soft",
     "Solution",
     "Solver",
     "TGS",
