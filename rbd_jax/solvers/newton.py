@@ -35,7 +35,9 @@ with delta [m/s] a traced number, so that a contact acts from a distance, and ep
 may be zero, which is the law above. "backward" keeps the values of the law above and smooths the derivatives only.
 Source: Howell et al. 2022 (Dojo), "Gradients" (the central path of an interior-point method).
 
-Cost: ``iterations`` 6x6 systems a body, or dense 6n x 6n systems where bodies touch each other (up to about 16).
+Cost: at most ``iterations`` systems in a forward rollout on a CPU (``newton_loop``: of the blocks that are filled, and
+none for a world that is solved). Elsewhere that many 6x6 systems a body, or dense 6n x 6n systems where bodies touch
+each other (up to about 16).
 Gradients: with ``polish`` = 0 exact, of the iteration as it runs. Else implicit, of the converged problem: one more
 system, no stored iterates, exact where a world is not ``unconverged``; first and second order, forward and reverse.
 """
@@ -289,16 +291,18 @@ class NewtonLagged(Solver):
         return worst > self.tolerance * scale + self.slip_speed
 
     def mismatch(self, c: Contacts, law: _Law, p: Impulses, u: Impulses, bound, free: Impulses):
-        """Of every row: the velocity that it lacks, its residual as a velocity, its fastest velocity [m/s]."""
+        """Of every row: the velocity that it lacks, its residual as a velocity, its fastest velocity, and the velocity
+        that its normal impulse gives [m/s]."""
         normal = jnp.abs(law.w * p.n - jnp.maximum(law.w * p.n - u.n - law.r * p.n, 0.0))
         speed = jnp.maximum(jnp.abs(free.n + law.vhat), jnp.abs(law.vhat))
+        load = law.w * p.n
         if not c.friction:
-            return normal, normal, speed
+            return normal, normal, speed, load
         limit, eps = self._friction(law, None, bound)
         drag = limit * _inverse_speed(u.t1, u.t2, eps)
         slip = law.w * jnp.maximum(jnp.abs(p.t1 + drag * u.t1), jnp.abs(p.t2 + drag * u.t2))
         speed = jnp.maximum(speed, jnp.maximum(jnp.abs(free.t1), jnp.abs(free.t2)))
-        return jnp.maximum(normal, slip / (1.0 + law.w * drag)), jnp.maximum(normal, slip), speed
+        return jnp.maximum(normal, slip / (1.0 + law.w * drag)), jnp.maximum(normal, slip), speed, load
 
     def _violation(self, system: _System, bounds, ps):
         """Largest residual of a row of a world, as a velocity [m/s] (B,), and the fastest relative velocity."""

@@ -3,8 +3,8 @@
 The Newton steps of ``newton``, of the points that are live in some world of the tile only, and of a world until its
 rows are solved: a stack at rest takes none. What a world takes does not depend on the others.
 
-A row is solved where the velocity that it lacks is below SETTLED of the fastest relative velocity of its world
-(``NewtonLagged.mismatch``).
+A row is solved where the velocity that it lacks (``NewtonLagged.mismatch``) is below SETTLED of the largest one that a
+normal impulse of its world gives, or where rounding hides it, ROUNDING of the fastest relative velocity.
 
 Everything of a pair is taken about the centre of its body B, in the contact frame, for which the arm of body A is
 that of B and one vector d more: relative velocities are those of one twist (V, W), u = V + W x r with
@@ -29,8 +29,8 @@ from .block_ldl import Blocks
 from .dense import Contacts
 from .rows import Impulses, Index, Rows
 
-#: A row is solved to this fraction of the fastest relative velocity of its world [-] (times 1e-3 in float64).
-SETTLED = 1e-5
+#: What a row may lack [-], over the load and over the fastest relative velocity of its world (in float64 1e-3 of that).
+SETTLED, ROUNDING = 1e-5, 3e-7
 
 
 @struct
@@ -109,7 +109,7 @@ def solve(solver, groups, p, bound, problem: Problem):
     full = lambda c: jnp.broadcast_to(c, (*c.shape[:-1], worlds))
     p, bound = jax.tree.map(full, (p, bound))
     zero = jnp.zeros(worlds, own.dtype)
-    settled = SETTLED * (1.0 if zero.dtype == jnp.float32 else 1e-3)
+    settled, rounding = (x * (1.0 if zero.dtype == jnp.float32 else 1e-3) for x in (SETTLED, ROUNDING))
     on = lambda pass_, *rest: piece(functools.partial(pass_, solver))(*rest, one)
 
     def step(carry):
@@ -121,12 +121,12 @@ def solve(solver, groups, p, bound, problem: Problem):
         for g, q in zip(groups, p):
             total = on(totals, g, q, total)
         motion = piece(response)(problem, total)
-        worst = (zero, zero, zero)
+        worst = (zero,) * 4
         for g, q, b in zip(groups, p, bound):
             worst = on(violation, g, q, b, motion, worst)
-        verdict = lambda lacks, rest, scale: (
+        verdict = lambda lacks, rest, scale, load: (
             rest > solver.tolerance * scale + solver.slip_speed,
-            lacks <= settled * scale,
+            lacks <= jnp.maximum(settled * load, rounding * scale),
         )
         wrong, solved = piece(verdict)(*worst)
         done = done | solved
