@@ -121,7 +121,10 @@ def test_the_gradient_contract_is_a_page(tmp_path):
     assert "| free flight |" in (tmp_path / "gradients.md").read_text()
 
 
-@pytest.mark.parametrize("script, page", (("scaling", "slope"), ("rooflines", "Gflop/s"), ("equal_error", "ratio")))
+PAGES = (("scaling", "slope"), ("rooflines", "Gflop/s"), ("equal_error", "ratio"), ("accelerator", "bound"))
+
+
+@pytest.mark.parametrize("script, page", PAGES)
 def test_speed_scripts_write_rows(tmp_path, script, page):
     smoke(f"{script}.py", tmp_path)
     assert page in (tmp_path / f"{script}.md").read_text()

@@ -14,7 +14,7 @@ from rbd_jax.xla import one_function, opaque_one
     "filled", [(), ((1, 0), (2, 1), (3, 2)), ((2, 0), (3, 0), (3, 1))], ids=["none", "chain", "star"]
 )
 def test_block_factorisation(filled):
-    """Against numpy, four bodies; the star fills (3, 2) while it is eliminated. What lies in empty blocks is ignored."""
+    """Against numpy, four bodies; the star fills (3, 2) on the way. What lies in empty blocks is ignored."""
     n, m, worlds = 4, 6, 32
     rng = np.random.default_rng(0)
     full = np.zeros((worlds, n, m, n, m))

@@ -108,11 +108,14 @@ def test_one_function_gives_what_kernels_give(worlds):
     few, steps = cut(state, 32), STEPS
     if model.method.solver.name == "newton_lagged":
         few, steps = run(model, few)[0], 1
+        few = few._with(status=jnp.zeros_like(few.status))
     go = lambda s: rbd.rollout(model, s, steps, every=steps)[0]
     direct = go(few)
     other = jax.jvp(go, (few,), (jax.tree.map(tangent, few),))[0]
     solved = ~(np.asarray(direct.status | other.status) & np.uint32(rbd.Status.NOT_CONVERGED)).astype(bool)
     assert solved.sum() > 28
+    if steps == 1:  # how the points of a face share its friction is not determined to this
+        direct, other = direct._with(memory=None), other._with(memory=None)
     for a, b in zip(bits(direct), bits(other), strict=True):
         np.testing.assert_allclose(a[solved], b[solved], rtol=2e-4, atol=2e-4)
 

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..loops import Listed, listed
 from ..spatial import Vec3
 from ..struct import struct
 from ..xla import in_one_function, materialise, piece, summed
@@ -33,7 +34,8 @@ UNROLL_COLOURS = 8
 class Group:
     """A group of rows with what every sweep needs: effective masses and, with restitution, events.
 
-    plan: for pairs that differ from world to world: where they went; the rows are in the order of its places.
+    plan: for pairs that differ from world to world: where they went; the rows are in the order of its places. points:
+    those that are live in any world, pair * slots + slot, in the order of a sweep: pair by pair, slot by slot.
     """
 
     rows: Rows
@@ -50,18 +52,7 @@ class Group:
     events: Events | None
     plan: Plan | None = None
     couples: Couples | None = None
-    points: Points | None = None
-
-
-@struct
-class Points:
-    """The points of a group that are live in any world, in the order of a sweep: pair by pair, slot by slot.
-
-    order: pair * slots + slot of each, int32 (P S,), of which the first ``count`` are valid.
-    """
-
-    order: jax.Array
-    count: jax.Array
+    points: Listed | None = None
 
 
 @struct
@@ -203,23 +194,8 @@ def prepare(rows: Rows, problem: Problem) -> Group:
         events=materialise_events(targets(rows, problem), one) if rows.e is not None else None,
         plan=chunks,
         couples=None if rows.mu_spin is None else _couples(rows, t1, t2, ib, ia),
-        points=_points(rows) if in_one_function() and isinstance(rows.b, Index) else None,
+        points=listed(rows.live.any(axis=-1).T.ravel()) if in_one_function() and isinstance(rows.b, Index) else None,
     )
-
-
-def _points(rows: Rows) -> Points:
-    live = rows.live.any(axis=-1).T.ravel()
-
-    def put(carry, x):
-        order, count = carry
-        number, counts = x
-        return (jax.lax.dynamic_update_slice(order, number[None], (count,)), count + counts), None
-
-    total = len(live)
-    # a point is written where the next one goes; the number stays only if it counts
-    start = (jnp.zeros(total, jnp.int32), jnp.int32(0))
-    (order, count), _ = jax.lax.scan(put, start, (jnp.arange(total, dtype=jnp.int32), live.astype(jnp.int32)))
-    return Points(order, count)
 
 
 def _couples(rows: Rows, t1: Vec3, t2: Vec3, ib, ia) -> Couples:

@@ -133,12 +133,12 @@ class NewtonLagged(Solver):
     def _in_loops(self, problem: Problem) -> Solution:
         bare = problem._with(rows=(), warm=())
         run = piece(functools.partial(newton_loop.group, self._of_group))
-        # what a group does not need must not be among the arguments of its function
-        needs = bare._with(q=None, inertia=None)
-        still = needs._with(v0=None, w0=None)
-        args = zip((rows._with(feature=None) for rows in problem.rows), problem.warm)
-        slow = lambda rows: rows.e is None and rows.law is None
-        found = [run(rows, warm, still if slow(rows) else needs) for rows, warm in args]
+        # what the rows of a group do not need must not be among the arguments of its function
+        least = bare._with(q=None, inertia=None)
+        found = []
+        for rows, warm in zip(problem.rows, problem.warm):
+            asks_back = rows.e is not None or rows.law is not None
+            found.append(run(rows._with(feature=None), warm, least if asks_back else least._with(v0=None, w0=None)))
         p, impulse, turn, wrong = newton_loop.solve(self, *zip(*found), bare)
         return Solution(impulse=impulse, angular_impulse=turn, contacts=p, unconverged=wrong)
 
