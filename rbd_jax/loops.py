@@ -92,6 +92,3 @@ def each_pair(f, matters, *args):
         return jax.tree.map(one, out, new)
 
     return over(rows, put, blank)
-
-
-__all__ = ["Listed", "each_pair", "listed", "of_pair", "of_point", "only_if", "over", "read", "repeat", "write"]

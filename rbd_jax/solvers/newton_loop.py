@@ -414,8 +414,8 @@ def _add_pair(solver, g: Group, motion, one, pair, bodies, h: Blocks, c, law, fr
     minus = lambda x, y: None if x is None else jnp.where(later, -x, -y)
     ab = (None, None, None) if spin is None else (cross_a, _transposed(cross), _transposed(spin_ba))
     block = -k, minus(cross, ab[0]), minus(spin_ba, ab[2]), minus(cross_ba, ab[1])
-    for corner, part in zip(CORNERS, block):
-        h = h if part is None else block_ldl.put(h, at, part, *corner)
+    for corner, part in zip(CORNERS, block if h.b.shape[1] == 6 else block[:1]):
+        h = block_ldl.put(h, at, jnp.zeros_like(k) if part is None else part, *corner)  # what is there does not count
     return block_ldl.fill(h, at)
 
 
