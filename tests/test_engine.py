@@ -60,6 +60,24 @@ def test_slides_to_stop(method):
     assert np.asarray(traj.pos)[:, 0, 2].max() < 0.1 + 1e-4
 
 
+@pytest.mark.parametrize("method", [*PRESETS, rbd.Method("symtop2", None, "pgs")], ids=["fast", "accurate", "pgs"])
+def test_slides_straight_whatever_way_it_lies(method):
+    """Friction is against the slip: a flat box neither swerves nor turns, though its tangents differ in mass."""
+    half, speed = (0.2, 0.15, 0.1), 3.0
+    body = rbd.Body("box", rbd.Box(half), pos=(0, 0, half[2]), friction=scenes.MU)
+    floor = rbd.Geom(rbd.Plane(), friction=scenes.MU)
+    model, one = rbd.build(rbd.Scene([body], [floor], dt=1 / 240), method=method)
+    angle = np.linspace(0, 2 * np.pi, 8, endpoint=False) + 0.3
+    zero = np.zeros((8, 1))
+    lies = np.stack([np.cos(angle), zero[:, 0], zero[:, 0], np.sin(angle)], -1)
+    heads = np.stack([np.cos(2.5 * angle), np.sin(2.5 * angle), zero[:, 0]], -1)
+    state = rbd.batch(one, 8).replace(vel=speed * heads[:, None], quat=lies[:, None])
+    final = rbd.rollout(model, state, 240, every=240)[0]
+    want = speed**2 / (2 * scenes.MU * G) * heads
+    np.testing.assert_allclose(np.asarray(final.pos)[:, 0, :2], want[:, :2], atol=5e-3 * np.abs(want).max())
+    np.testing.assert_allclose(np.abs((np.asarray(final.quat)[:, 0] * lies).sum(-1)), 1.0, atol=1e-5)
+
+
 @pytest.mark.parametrize("method", PRESETS)
 def test_slips_until_it_rolls(method):
     scene = scenes.ball(0.1, vel=(3.0, 0, 0), friction=scenes.MU)

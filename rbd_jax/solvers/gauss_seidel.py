@@ -489,11 +489,7 @@ def _point(pair: Group, at, local, one):
         if spin and va is not None and not rows.central_a:
             j = pair.inertia_a @ ra.cross(n)
             u1, u2 = u1 + ra.cross(t1).dot(j) * dn, u2 + ra.cross(t2).dot(j) * dn
-        c1, c2 = materialise((lam.t1 - mass_1 * u1, lam.t2 - mass_2 * u2), one)
-        limit, c = rows.mu * ln, c1 * c1 + c2 * c2
-        slips = c > limit * limit
-        shrink = jnp.where(slips, limit / jnp.sqrt(jnp.where(slips, c, 1.0)), 1.0)
-        l1, l2 = c1 * shrink, c2 * shrink
+        l1, l2 = _on_disc((lam.t1, lam.t2), (u1, u2), (mass_1, mass_2), rows.mu * ln, one)
         p = p + t1 * (l1 - lam.t1) + t2 * (l2 - lam.t2)
     p = materialise(p, one)
     vb = vb + p * pair.inv_mass_b
@@ -505,11 +501,28 @@ def _point(pair: Group, at, local, one):
             wa = wa - pair.inertia_a @ ra.cross(p)
     new = Impulses(ln, l1, l2)
     if pair.couples is not None:
-        wb, wa, new = _turned(pair, lam, materialise(new, one), wb, wa)
+        wb, wa, new = _turned(pair, lam, materialise(new, one), wb, wa, one)
     return (materialise((vb, wb), one), None if va is None else materialise((va, wa), one)), new
 
 
-def _turned(pair: Group, lam: Impulses, new: Impulses, wb: Vec3, wa: Vec3 | None):
+def _on_disc(lam, u, mass, limit, one):
+    """Friction (2,) that stops the slip ``u``, or that of the disc of radius ``limit`` against it.
+
+    What stops it takes each tangent's own mass. On the disc one mass serves both: with two, the impulse would come to
+    rest against (m_1 u_1, m_2 u_2), and a sliding body would be pushed aside, however many sweeps there are.
+    """
+    stop = lam[0] - mass[0] * u[0], lam[1] - mass[1] * u[1]
+    slips = stop[0] * stop[0] + stop[1] * stop[1] > limit * limit
+    both = 0.5 * (mass[0] + mass[1])
+    pick = lambda k: lam[k] - jnp.where(slips, both, mass[k]) * u[k]
+    c1, c2 = materialise((pick(0), pick(1)), one)
+    size = c1 * c1 + c2 * c2
+    slips = size > limit * limit
+    shrink = jnp.where(slips, limit / jnp.sqrt(jnp.where(slips, size, 1.0)), 1.0)
+    return c1 * shrink, c2 * shrink
+
+
+def _turned(pair: Group, lam: Impulses, new: Impulses, wb: Vec3, wa: Vec3 | None, one):
     """Spins after torsional friction |s| <= nu_s p_n about the normal and rolling |r| <= nu_r p_n across it."""
     c, n = pair.couples, pair.rows.n
     spin = wb if wa is None else wb - wa
@@ -519,12 +532,9 @@ def _turned(pair: Group, lam: Impulses, new: Impulses, wb: Vec3, wa: Vec3 | None
     new = new._with(s=jnp.clip(lam.s - c.mass_s * n.dot(spin), -limit, limit))
     change = n * (new.s - lam.s)
     if c.mu_roll is not None:
-        r1 = lam.r1 - c.mass_1 * pair.t1.dot(spin)
-        r2 = lam.r2 - c.mass_2 * pair.t2.dot(spin)
-        limit, size = c.mu_roll * new.n, r1 * r1 + r2 * r2
-        turns = size > limit * limit
-        shrink = jnp.where(turns, limit / jnp.sqrt(jnp.where(turns, size, 1.0)), 1.0)
-        new = new._with(r1=r1 * shrink, r2=r2 * shrink)
+        turning = pair.t1.dot(spin), pair.t2.dot(spin)
+        r1, r2 = _on_disc((lam.r1, lam.r2), turning, (c.mass_1, c.mass_2), c.mu_roll * new.n, one)
+        new = new._with(r1=r1, r2=r2)
         change = change + pair.t1 * (new.r1 - lam.r1) + pair.t2 * (new.r2 - lam.r2)
     wb = wb + pair.inertia_b @ change
     return wb, None if wa is None else wa - pair.inertia_a @ change, new
