@@ -58,7 +58,7 @@ def build(scene: Scene, dt: float | None = None, method: str | Method = "accurat
     if not (np.isfinite(dt) and dt > 0):
         raise ValueError(f"build: dt = {dt} must be finite and > 0 [s]")
     r = resolve(scene)
-    method = find(method).resolve(dt, scene.integrator, *_boxes_that_touch(r))
+    method = find(method).resolve(dt, scene.integrator, *_boxes_that_touch(r), touch=len(r.pairs) > 0)
     dtype = jnp.result_type(float)
     n = len(r.mass)
 

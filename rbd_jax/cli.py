@@ -107,6 +107,22 @@ def _batches(text: str) -> list[int]:
     return [_integer(1)(part) for part in text.split(",")]
 
 
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name for name in text.split(",") if name)
+
+
+def _add_suite(sub) -> None:
+    sub.add_argument("--results", metavar="DIR", help="rows, charts and report (default benchmarks/results)")
+    for what in ("case", "engine"):
+        sub.add_argument(
+            f"--add-{what}s",
+            action="append",
+            default=[],
+            metavar="DIR",
+            help=f"further {what}s of the suite, a file each",
+        )
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="rbd-jax",
@@ -133,8 +149,8 @@ def _parser() -> argparse.ArgumentParser:
         sub.set_defaults(command=command, prog=sub.prog)
         return sub
 
-    def add_scene(sub, method="accurate", dt=True):
-        sub.add_argument("scene", metavar="SCENE", help=SCENE_HELP)
+    def add_scene(sub, method="accurate", dt=True, needed=True):
+        sub.add_argument("scene", metavar="SCENE", nargs=None if needed else "?", help=SCENE_HELP)
         sub.add_argument("--method", default=method, metavar="NAME", help=METHOD_HELP)
         if dt:
             sub.add_argument("--dt", type=_number("> 0", "s"), metavar="S", help="step [s] (default: the scene's)")
@@ -194,11 +210,19 @@ def _parser() -> argparse.ArgumentParser:
     sub = add(
         "bench",
         _bench,
-        "measure compile time, speed and penetration, beside MuJoCo on all threads",
-        "example:\n  rbd-jax bench box_stack --batch 1,64,1024 --method fast --append results.jsonl\n\n"
-        "MuJoCo runs the same scene at the same step through mujoco.rollout; its rate does not depend on the batch.",
+        "measure a scene beside MuJoCo, or the suite of speed against accuracy",
+        "examples:\n  rbd-jax bench box_stack --batch 1,64,1024 --method fast --append results.jsonl\n"
+        "  rbd-jax bench --suite standard --engines ours,mujoco\n\n"
+        "A scene: compile time, speed and penetration; MuJoCo runs it at the same step through mujoco.rollout on all\n"
+        "threads; its rate does not depend on the batch. A suite: cases in engines, see benchmarks/README.md; rows\n"
+        "are appended to suite.jsonl as they come, an interrupted run goes on where it stopped.",
     )
-    add_scene(sub)
+    add_scene(sub, needed=False)
+    sub.add_argument("--suite", metavar="NAME", help="smoke (two cases, a minute), standard or full")
+    _add_suite(sub)
+    sub.add_argument("--cases", type=_names, default=(), metavar="A,B", help="of the suite, default all")
+    sub.add_argument("--engines", type=_names, default=(), metavar="A,B", help="of the suite, default all installed")
+    sub.add_argument("--fresh", action="store_true", help="begin a new run of the suite")
     sub.add_argument(
         "--batch", type=_batches, default=[1024], metavar="B[,B...]", help="numbers of worlds (default 1024)"
     )
@@ -207,6 +231,15 @@ def _parser() -> argparse.ArgumentParser:
     add_noise(sub)
     sub.add_argument("--append", metavar="FILE", help="append one JSON line for each batch size")
     sub.add_argument("--json", action="store_true", help="print the JSON lines instead of the text")
+
+    sub = add(
+        "chart",
+        _chart,
+        "draw the charts of the suite's rows and write the report",
+        "example:\n  rbd-jax chart --results benchmarks/results",
+    )
+    _add_suite(sub)
+    sub.add_argument("--run", metavar="ID", help="only the rows of this run (default: the newest of each point)")
 
     summary = "versions, devices, extras, shipped examples and presets"
     sub = add("info", _info, summary, "example:\n  rbd-jax info --json")
@@ -553,10 +586,40 @@ def _validate(args) -> int:
     return OK if report.ok else FAILED
 
 
+# --- the suite ---
+
+
+def _suite(args) -> int:
+    from . import suite
+
+    with _user_errors():
+        rows = suite.bench(
+            args.suite, args.cases, args.engines, args.add_cases, args.add_engines, args.results, args.fresh,
+            say=lambda text: print(text, flush=True),
+        )  # fmt: skip
+    print(f"wrote {rows}; 'rbd-jax chart' draws it")
+    return OK
+
+
+def _chart(args) -> int:
+    from . import suite
+
+    with _user_errors():
+        files = suite.chart(args.results, args.run, args.add_cases, args.add_engines)
+    for path in files:
+        if str(path).endswith((".html", ".md")):
+            print(f"wrote {path}")
+    return OK
+
+
 # --- bench ---
 
 
 def _bench(args) -> int:
+    if (args.scene is None) == (args.suite is None):
+        raise UsageError(f"{args.prog}: error: give either SCENE or --suite NAME")
+    if args.suite is not None:
+        return _suite(args)
     _check_outputs(args.append)
     scene, _ = _scene(args.scene)
     import jax

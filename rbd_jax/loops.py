@@ -22,6 +22,13 @@ def write(tree, row, values):
     return jax.tree.map(put, tree, values)
 
 
+def add(x, where, values):
+    """The array x with ``values`` added to its block that begins at ``where``, an index for every axis."""
+    where = tuple(jnp.asarray(i, jnp.int32) for i in where)
+    old = jax.lax.dynamic_slice(x, where, values.shape, allow_negative_indices=False)
+    return jax.lax.dynamic_update_slice(x, old + values, where, allow_negative_indices=False)
+
+
 def repeat(start, stop, body, carry):
     """``carry = body(i, carry)`` for i = start, ..., stop - 1, which may be traced."""
     step = lambda c: (c[0] + 1, body(c[0], c[1]))

@@ -35,7 +35,7 @@ class Method:
         dt > 1/240 s min(1, 8 / boxes) min(1, sqrt(size / 0.2 m)) or where their masses differ by more than 10 : 1; else
         "tgs", with two to four sweeps for three to five and more boxes.
       substeps: steps inside a step of dt; None: 1, or for "tgs" and "penalty" as many as keep a substep within
-        1/240 s at the dt of ``build``.
+        1/240 s at the dt of ``build`` where anything may touch anything.
       events: with pairs that mention restitution, impacts a world may have in a (sub)step at their own instant, with
         the position and normal they
         have there; what follows the last of them is a step of the remaining length. 0: none, an impact is
@@ -65,6 +65,7 @@ class Method:
         size: float = 1.0,
         ratio: float = 1.0,
         alone: bool = False,
+        touch: bool = True,
     ) -> Method:
         """Names replaced by instances and ``substeps`` by a number.
 
@@ -72,6 +73,7 @@ class Method:
           dt: step [s]. scene_integrator: what "scene" stands for.
           boxes, size, ratio: number of boxes that may touch each other, the smallest edge of one [m], the
             largest mass over the smallest. alone: whether bodies touch each other with nothing but boxes.
+          touch: whether anything may touch anything.
 
         Raises:
           ValueError: an unknown name, a combination of model and solver that does not exist,
@@ -117,7 +119,7 @@ class Method:
             )
         substeps = self.substeps
         if substeps is None:
-            substeps = max(1, round(dt / SUBSTEP + 0.49)) if solver.substeps else 1
+            substeps = max(1, round(dt / SUBSTEP + 0.49)) if solver.substeps and touch else 1
         if substeps > MAX_SUBSTEPS:
             raise ValueError(f"Method: dt = {dt} s needs {substeps} substeps, at most {MAX_SUBSTEPS}: use a smaller dt")
         return Method(integrator, contact, solver, substeps, self.capacity, self.events)

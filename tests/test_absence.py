@@ -98,6 +98,14 @@ def test_isotropic_body_needs_one_exponential_and_no_trigonometry_elsewhere():
     assert not {"sin", "cos", "tan", "sqrt", "rsqrt", "exp"} & set(ops), "no attitude, no friction: no root at all"
 
 
+def test_without_contact_no_substeps():
+    """Substeps are for contact; MuJoCo's step of 20 ms needs five of them where something may touch."""
+    body = rbd.Body("a", rbd.Box((0.1, 0.2, 0.3)), pos=(0, 0, 1))
+    free, _ = rbd.build(rbd.Scene([body], dt=0.02), method="fast")
+    grounded, _ = rbd.build(rbd.Scene([body], [rbd.Plane()], dt=0.02), method="fast")
+    assert (free.method.substeps, grounded.method.substeps) == (1, 5)
+
+
 def test_bodies_on_static_ground_are_not_coupled():
     """Many spheres on a plane: the program is that of one, with no gather and no scatter."""
     many = rbd.Scene(

@@ -38,6 +38,7 @@ LAYER = {
     "horizon": 8,
     "parity": 9,
     "record": 9,
+    "suite": 9,
     "view": 9,
     "cli": 10,
     "examples": 3,

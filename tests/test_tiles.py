@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import rbd_jax as rbd
-from rbd_jax.memory import available, refuse
+from rbd_jax.memory import _of_machine, available, refuse
 from rbd_jax.xla import one_function, piece
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -320,6 +320,21 @@ def test_memory_estimate_is_what_the_process_takes(cores):
         if 0.8 < estimate / max(measured, 1) < 1.2:
             return
     pytest.fail(f"estimated {estimate}, measured {measured} bytes; {done.stderr}")
+
+
+def test_available_memory_of_a_container(tmp_path):
+    """What counts is the smaller of the machine's and the container's, whose copies of files can be dropped."""
+    proc, group = tmp_path / "meminfo", tmp_path / "group"
+    group.mkdir()
+    assert _of_machine(proc, group) is None
+    proc.write_text("MemTotal: 16000 kB\nMemAvailable: 9000 kB\n")
+    assert _of_machine(proc, group) == 9000 * 1024
+    files = {"max": "8000000", "current": "5000000", "stat": "anon 3000000\ninactive_file 1500000\nactive_file 9\n"}
+    for name, text in files.items():
+        (group / f"memory.{name}").write_text(text)
+    assert _of_machine(proc, group) == 8000000 - 5000000 + 1500000
+    (group / "memory.max").write_text("max")  # no limit
+    assert _of_machine(proc, group) == 9000 * 1024
 
 
 def test_memory_estimate_refuses_nonsense():

@@ -41,6 +41,7 @@ class Engine(abc.ABC):
       widths: dtypes it computes in.
       install: how to get it.
       any_number: whether the time per world of many worlds does not depend on their number, so that fewer may be timed.
+      compiles: whether the first run at a step may compile a program.
       scales: whether ``timer`` runs the worlds on all cores; else the time per world of many worlds is divided by the
         number of cores, as if one process a core were started.
     """
@@ -53,6 +54,7 @@ class Engine(abc.ABC):
     install: str = ""
     scales: bool = True
     any_number: bool = False
+    compiles: bool = False
 
     def missing(self) -> str | None:
         """None where it can be used here, else why not."""

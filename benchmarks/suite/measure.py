@@ -5,6 +5,7 @@ Run by ``run`` in a process of its own, so that a peer that crashes or hangs cos
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import pathlib
@@ -24,6 +25,8 @@ from .plan import Job
 
 #: Own limit of an engine: its run at the finest step over this.
 FINER = 4
+#: In the place of a step: the run at that one.
+LIMIT = "limit"
 #: An error from here on is no solution.
 LOST = 1e3
 REPEATS = 4
@@ -66,8 +69,9 @@ class Sweep:
         case, steps = self.case, self.case.steps_a_sample(dt)
         simulation = self.load(dt)
         start = case.start().worlds(self.worlds)
+        if self.cost is None or self.engine.compiles:
+            simulation.motion(start, 1, steps)  # another step may be another program
         if self.cost is None:
-            simulation.motion(start, 1, steps)  # compiles
             begin = time.perf_counter()
             simulation.motion(start, 1, steps)
             self.cost = (time.perf_counter() - begin) / (self.worlds * steps)
@@ -169,10 +173,12 @@ def measure(job: Job, case: Case, engine: Engine, done: set, write, current) -> 
             continue
         limit = None
         if case.distance is not None and motions:
-            finest = min(motions)
-            fine = finest / FINER
-            current((variant, dtype, finest))
-            limit = sweep.run(fine) if sweep.affordable(fine) else motions[finest]
+            limit = motions[min(motions)]
+            fine = min(motions) / FINER
+            if (variant, dtype, LIMIT) not in done and sweep.affordable(fine):
+                current((variant, dtype, LIMIT))
+                with contextlib.suppress(Exception):  # then the finest step is the limit
+                    limit = sweep.run(fine)
         for dt in job.steps:
             if (variant, dtype, dt) in done:
                 continue

@@ -11,6 +11,8 @@ from .engine import Engine
 PRESETS = ("fast", "accurate")
 INTEGRATORS = ("forward_euler", "semi_implicit", "rk4", "midpoint", "buss2", "symtop2")
 SOLVERS = ("pgs", "newton_cone", "penalty")
+#: Cases of the smoke size, where none are named.
+SMOKE = ("parabola", "elastic")
 #: Cases of the solvers.
 SOLVED = ("slide", "incline", "column")
 

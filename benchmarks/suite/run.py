@@ -46,7 +46,8 @@ def chosen(choice: Choice):
         _unknown("suite", choice.suite, plan.SUITES)
     found = all_cases.load(*choice.case_folders)
     rivals = all_engines.load(*choice.engine_folders)
-    return pick(found, choice.cases, "case"), pick(rivals, choice.engines, "engine")
+    few = choice.cases or (plan.SMOKE if choice.suite == "smoke" else ())
+    return pick(found, few, "case"), pick(rivals, choice.engines, "engine")
 
 
 def _unknown(what, name, known):
@@ -113,7 +114,7 @@ def _job(job, choice, rows_file, same, say) -> None:
     for _ in range(RESTARTS):
         rows, _ = store.read(rows_file)
         mine = [r for r in rows if r.get("run") == same["run"] and r.get("case") == job.case]
-        mine = [r for r in mine if r.get("engine") == job.engine and r["kind"] in ("point", "refused")]
+        mine = [r for r in mine if r.get("engine") == job.engine and r["kind"] in ("point", "refused", "limit")]
         done = [(r["variant"], r["dtype"], r.get("dt")) for r in mine]
         left = job.limit_s - (time.perf_counter() - begin)
         code, point = _process(job, choice, rows_file, same, done, left)
@@ -123,7 +124,7 @@ def _job(job, choice, rows_file, same, say) -> None:
         reason = "time limit" if code is None else f"its process ended with {_words(code)}"
         if point is not None:
             variant, dtype, dt = point
-            row = {"kind": "point", "case": job.case, "engine": job.engine, "variant": variant, "dtype": dtype,
+            row = {"kind": dt if dt == "limit" else "point", "case": job.case, "engine": job.engine, "variant": variant, "dtype": dtype,
                    "dt": dt, "status": "skipped" if code is None else "failed", "reason": reason, "error": None,
                    "self_error": None, "seconds": {}, "compile_s": {}}  # fmt: skip
             store.append(rows_file, {**same, **row})

@@ -59,8 +59,8 @@ def solve(h: Blocks, one) -> jax.Array:
     return repeat(0, n, lambda k, x: _back(h, x, n - 1 - k, n, one), h.b)
 
 
-def _at(c, r: int):
-    """Row r of a column (1, m, B), (1, 1, B)."""
+def entry(c, r: int):
+    """Entry r of a column (1, m, B), (1, 1, B)."""
     return jax.lax.slice_in_dim(c, r, r + 1, axis=1)
 
 
@@ -68,14 +68,14 @@ def _column(block, j: int):
     return jax.lax.index_in_dim(block, j, 1, keepdims=False)
 
 
-def _across(c):
+def across(c):
     """A column (1, m, B) as a row: one entry for every column of a block, (1, m, 1, B)."""
     return c.reshape(1, c.shape[1], 1, c.shape[2])
 
 
 def _outer(left, d, right):
     """left diag(d) right' of columns left, right and the diagonal d, lists of (1, m, B)."""
-    return sum(_across(d_ * r) * l[:, None] for l, d_, r in zip(left, d, right))
+    return sum(across(d_ * r) * l[:, None] for l, d_, r in zip(left, d, right))
 
 
 def _eliminate(h: Blocks, k, n: int, one) -> Blocks:
@@ -85,12 +85,12 @@ def _eliminate(h: Blocks, k, n: int, one) -> Blocks:
     number = np.arange(m).reshape(1, m, 1)
     low, d, inverse, kept = [], [], [], []
     for j in range(m):
-        column = materialise(_column(own, j) - sum(low[c] * (d[c] * _at(low[c], j)) for c in range(j)), one)
-        d.append(_at(column, j))
+        column = materialise(_column(own, j) - sum(low[c] * (d[c] * entry(low[c], j)) for c in range(j)), one)
+        d.append(entry(column, j))
         inverse.append(materialise(1.0 / d[j], one))
         low.append(materialise(jnp.where(number > j, column, 0.0) * inverse[j], one))
         if j < m - 1:
-            y = materialise(y - low[j] * _at(y, j), one)
+            y = materialise(y - low[j] * entry(y, j), one)
         kept.append(jnp.where(number == j, d[j], low[j])[:, None])
     h = h._with(diagonal=write(h.diagonal, k, jnp.concatenate(kept, axis=1)), b=write(h.b, k, y))
     if h.below is None:
@@ -102,11 +102,11 @@ def _eliminate(h: Blocks, k, n: int, one) -> Blocks:
         e = materialise(read(h.below, place(i, k)), one)
         left = []
         for j in range(m):
-            less = sum(left[c] * _at(scaled[c], j) for c in range(j))
+            less = sum(left[c] * entry(scaled[c], j) for c in range(j))
             left.append(materialise((_column(e, j) - less) * inverse[j], one))
         own, rest = read((h.diagonal, h.b), i)
         own = own - _outer(left, d, left)
-        rest = rest - sum(left[c] * _at(y, c) for c in range(m))
+        rest = rest - sum(left[c] * entry(y, c) for c in range(m))
         diagonal, b = write((h.diagonal, h.b), i, (own, rest))
         below = h.below
         for j in range(m):
@@ -133,13 +133,13 @@ def _back(h: Blocks, x: jax.Array, k, n: int, one) -> jax.Array:
     m = x.shape[1]
     own, z = read((h.diagonal, x), k)
     own = materialise(own, one)
-    z = z / jnp.concatenate([_at(_column(own, i), i) for i in range(m)], axis=1)
+    z = z / jnp.concatenate([entry(_column(own, i), i) for i in range(m)], axis=1)
     if h.below is not None:
 
         def take(i, z):
             def less(z):
                 block, xi = read(h.below, place(i, k)), read(x, i)
-                return z - sum(block[:, :, r] * _at(xi, r) for r in range(m))
+                return z - sum(block[:, :, r] * entry(xi, r) for r in range(m))
 
             return only_if(h.filled[place(i, k)], less, z)
 
@@ -147,5 +147,5 @@ def _back(h: Blocks, x: jax.Array, k, n: int, one) -> jax.Array:
     number = np.arange(m).reshape(1, m, 1)
     for j in reversed(range(1, m)):  # row j of L takes x_j from the entries before it
         before = jnp.where(number < j, own[:, :, j], 0.0)
-        z = materialise(z - before * _at(z, j), one)
+        z = materialise(z - before * entry(z, j), one)
     return write(x, k, z)

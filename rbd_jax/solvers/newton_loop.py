@@ -19,13 +19,13 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from ..loops import Listed, each_pair, listed, of_pair, of_point, only_if, over, read, repeat
+from ..loops import Listed, add, each_pair, listed, of_pair, of_point, only_if, over, read, repeat
 from ..spatial import Vec3, components
 from ..struct import struct
 from ..xla import materialise, piece
 from . import block_ldl, dense
 from .base import Problem
-from .block_ldl import Blocks
+from .block_ldl import Blocks, across, entry
 from .dense import Contacts
 from .rows import Impulses, Index, Rows
 
@@ -248,35 +248,24 @@ def _combined(q, factors):
     return sum(scaled[1:], scaled[0])
 
 
-def added(x, row, first: int, values):
-    """x (n, m, B) with ``values`` (1, k, B) added at row ``row``, entries ``first`` to first + k - 1."""
-    at = (row, jnp.int32(first), jnp.int32(0))
-    old = jax.lax.dynamic_slice(x, at, values.shape, allow_negative_indices=False)
-    return jax.lax.dynamic_update_slice(x, old + values, at, allow_negative_indices=False)
-
-
 def on_bodies(x, q, force, torque, apart, bodies, one):
     """x (n, m, B) with a wrench about the centre of B added to B and taken from A; lists in the contact frame."""
     force = materialise(_combined(q, force), one)
-    x = added(x, bodies[0], 0, force)
+    x = add(x, (bodies[0], 0, 0), force)
     if len(bodies) > 1:
-        x = added(x, bodies[1], 0, -force)
+        x = add(x, (bodies[1], 0, 0), -force)
     if torque is None:
         return x
     torque = materialise(_combined(q, torque), one)
-    x = added(x, bodies[0], 3, torque)
+    x = add(x, (bodies[0], 3, 0), torque)
     if len(bodies) > 1:
-        x = added(x, bodies[1], 3, -torque - _crossed(apart, force))
+        x = add(x, (bodies[1], 3, 0), -torque - _crossed(apart, force))
     return x
-
-
-def _entry(c, i: int):
-    return jax.lax.slice_in_dim(c, i, i + 1, axis=1)
 
 
 def _crossed(columns, x):
     """d x x of a column x (1, 3, B), with the columns of [d]x."""
-    return sum(columns[i] * _entry(x, i) for i in range(3))
+    return sum(columns[i] * entry(x, i) for i in range(3))
 
 
 def cross_columns(d: Vec3 | None, one):
@@ -402,7 +391,7 @@ def _add_pair(solver, g: Group, motion, one, pair, bodies, h: Blocks, c, law, fr
     cross_a = cross_ba = spin_ba = spin_a = None
     if spin is not None:
         turn = lambda m: sum(apart[i][:, None] * m[:, :, i : i + 1] for i in range(3))  # [d]x M
-        back = lambda m: sum(m[:, i : i + 1] * _across(apart[i]) for i in range(3))  # M [d]x'
+        back = lambda m: sum(m[:, i : i + 1] * across(apart[i]) for i in range(3))  # M [d]x'
         cross_a = materialise(cross + turn(k), one)  # [ra]x G
         spin_ba = materialise(spin + back(cross), one)  # [rb]x G [ra]x'
         cross_ba = materialise(_transposed(cross_a), one)  # G [ra]x'
@@ -423,11 +412,6 @@ def _add_pair(solver, g: Group, motion, one, pair, bodies, h: Blocks, c, law, fr
 CORNERS = ((0, 0), (0, 3), (3, 3), (3, 0))
 
 
-def _across(c):
-    """A column (1, 3, B) as a row, one entry for every column of a block, (1, 3, 1, B)."""
-    return c.reshape(1, c.shape[1], 1, c.shape[2])
-
-
 def _transposed(m):
     return jnp.swapaxes(m, 1, 2)
 
@@ -439,7 +423,7 @@ def _rotated(q, m, one):
         if q[j] is None or all(m[i][j] is None for i in range(3)):
             continue
         half = materialise(_combined(q, [m[i][j] for i in range(3)]), one)
-        part = half[:, None] * _across(q[j])
+        part = half[:, None] * across(q[j])
         total = part if total is None else total + part
     return materialise(total, one)
 
@@ -449,7 +433,5 @@ def _added_block(blocks, row, *parts):
     for (column, first), part in zip(CORNERS, parts):
         if part is None:
             continue
-        at = (row, jnp.int32(column), jnp.int32(first), jnp.int32(0))
-        old = jax.lax.dynamic_slice(blocks, at, part.shape, allow_negative_indices=False)
-        blocks = jax.lax.dynamic_update_slice(blocks, old + part, at, allow_negative_indices=False)
+        blocks = add(blocks, (row, column, first, 0), part)
     return blocks

@@ -14,12 +14,10 @@ import importlib
 import importlib.metadata
 import importlib.util
 import math
-from collections.abc import Callable
-
-import numpy as np
 
 from ..case import Case, Motion, Part
 from ..engine import Engine, Refused, Simulation
+from ._worlds import State, WorldByWorld, columns
 
 #: A limit of every coordinate's velocity, 100 by default, that is to bind nothing.
 UNLIMITED = 1e6
@@ -48,7 +46,7 @@ class BulletEngine(Engine):
         return _Simulation(case, variant, dt)
 
 
-class _Simulation(Simulation):
+class _Simulation(WorldByWorld):
     def __init__(self, case: Case, variant: str, dt: float):
         self.bullet = importlib.import_module("pybullet")
         self.case, self.dt = case, dt
@@ -58,34 +56,12 @@ class _Simulation(Simulation):
             raise Refused("no more physics clients")
         self.bodies = []
 
-    def motion(self, start: Motion, samples: int, steps_a_sample: int) -> Motion:
-        worlds = []
-        for world in range(start.pos.shape[1]):
-            self._build()  # anew: contact points remember their impulses
-            self._reset(start, world)
-            states = [self._state()]
-            for _ in range(samples):
-                self._advance(steps_a_sample)
-                states.append(self._state())
-            worlds.append(states)
-        times = self.dt * steps_a_sample * np.arange(samples + 1)
-        return Motion(times, *(np.array(x).swapaxes(0, 1) for x in zip(*map(_columns, worlds), strict=True)))
-
-    def timer(self, start: Motion, steps: int) -> tuple[Callable[[], None], int, int]:
-        self._build()
-
-        def call():
-            self._reset(start, 0)
-            self._advance(steps)
-
-        return call, 1, steps
-
     def close(self) -> None:
         if self.client >= 0:
             self.bullet.disconnect(self.client)
         self.client = -1
 
-    def _build(self) -> None:
+    def begin(self) -> None:
         """An empty world, then the case."""
         b, client = self.bullet, self.client
         b.resetSimulation(client)
@@ -132,7 +108,7 @@ class _Simulation(Simulation):
             )  # fmt: skip
         return body
 
-    def _reset(self, start: Motion, world: int) -> None:
+    def place(self, start: Motion, world: int) -> None:
         b, client = self.bullet, self.client
         for k, body in enumerate(self.bodies):
             pos, (w, x, y, z) = start.pos[0, world, k].tolist(), start.quat[0, world, k].tolist()
@@ -140,22 +116,17 @@ class _Simulation(Simulation):
             vel, omega = start.vel[0, world, k].tolist(), start.omega[0, world, k].tolist()
             b.resetBaseVelocity(body, vel, omega, physicsClientId=client)
 
-    def _advance(self, steps: int) -> None:
+    def advance(self, steps: int) -> None:
         step, client = self.bullet.stepSimulation, self.client
         for _ in range(steps):
             step(client)
 
-    def _state(self):
-        """(pos, quat, vel, omega) of every body."""
+    def state(self) -> State:
         b, rows = self.bullet, []
         for body in self.bodies:
             pos, (x, y, z, w) = b.getBasePositionAndOrientation(body, self.client)
             rows.append((pos, (w, x, y, z), *b.getBaseVelocity(body, self.client)))
-        return _columns(rows)
-
-
-def _columns(rows):
-    return tuple(np.array(c, np.float64) for c in zip(*rows, strict=True))
+        return columns(rows)
 
 
 ENGINE = BulletEngine()

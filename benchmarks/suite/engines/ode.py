@@ -10,12 +10,12 @@ from __future__ import annotations
 import ctypes
 import importlib
 import importlib.util
-from collections.abc import Callable
 
 import numpy as np
 
 from ..case import Case, Motion, Part
 from ..engine import Engine, Refused, Simulation
+from ._worlds import State, WorldByWorld, columns
 
 #: What collides with what: bodies with all, planes with bodies.
 BODY, PLANE = 1, 2
@@ -44,14 +44,14 @@ class OdeEngine(Engine):
         return _Simulation(case, variant, dt)
 
 
-class _Simulation(Simulation):
+class _Simulation(WorldByWorld):
     def __init__(self, case: Case, variant: str, dt: float):
         self.ode = ode = importlib.import_module("ode")
         self.dt = dt
         self.world = ode.World()
         self.world.setGravity(case.gravity)
         self.world.setERP(0.2)
-        self.advance = self.world.quickStep if variant == "quick" else self.world.step
+        self.step = self.world.quickStep if variant == "quick" else self.world.step
         self.space = ode.HashSpace()
         self.contacts = ode.JointGroup()
         self.seed = getattr(_library(), "dRandSetSeed", None)
@@ -61,24 +61,9 @@ class _Simulation(Simulation):
         self.shapes = [self._plane(*plane) for plane in case.planes]
         self.bodies = [self._body(part) for part in case.parts]
 
-    def motion(self, start: Motion, samples: int, steps_a_sample: int) -> Motion:
-        worlds = []
-        for world in range(start.pos.shape[1]):
-            self._reset(start, world)
-            states = [self._state()]
-            for _ in range(samples):
-                self._advance(steps_a_sample)
-                states.append(self._state())
-            worlds.append(states)
-        times = self.dt * steps_a_sample * np.arange(samples + 1)
-        return Motion(times, *(np.array(x).swapaxes(0, 1) for x in zip(*map(_columns, worlds), strict=True)))
-
-    def timer(self, start: Motion, steps: int) -> tuple[Callable[[], None], int, int]:
-        def call():
-            self._reset(start, 0)
-            self._advance(steps)
-
-        return call, 1, steps
+    def begin(self) -> None:
+        if self.seed:
+            self.seed(0)  # quickStep shuffles its rows: the same way in every run
 
     def _plane(self, point, normal):
         normal = np.asarray(normal, np.float64)
@@ -104,9 +89,7 @@ class _Simulation(Simulation):
         self.shapes.append(shape)
         return body
 
-    def _reset(self, start: Motion, world: int) -> None:
-        if self.seed:
-            self.seed(0)  # quickStep shuffles its rows: the same way in every run
+    def place(self, start: Motion, world: int) -> None:
         for k, body in enumerate(self.bodies):
             body.setPosition(start.pos[0, world, k].tolist())
             body.setQuaternion(start.quat[0, world, k].tolist())
@@ -124,22 +107,15 @@ class _Simulation(Simulation):
                 contact.setBounceVel(0.0)
             ode.ContactJoint(self.world, self.contacts, contact).attach(one.getBody(), other.getBody())
 
-    def _advance(self, steps: int) -> None:
-        collide, near, advance, dt, forget = self.space.collide, self._near, self.advance, self.dt, self.contacts.empty
+    def advance(self, steps: int) -> None:
+        collide, near, step, dt, forget = self.space.collide, self._near, self.step, self.dt, self.contacts.empty
         for _ in range(steps):
             collide(None, near)
-            advance(dt)
+            step(dt)
             forget()
 
-    def _state(self):
-        """(pos, quat, vel, omega) of every body."""
-        return _columns(
-            [(b.getPosition(), b.getQuaternion(), b.getLinearVel(), b.getAngularVel()) for b in self.bodies]
-        )
-
-
-def _columns(rows):
-    return tuple(np.array(c, np.float64) for c in zip(*rows, strict=True))
+    def state(self) -> State:
+        return columns([(b.getPosition(), b.getQuaternion(), b.getLinearVel(), b.getAngularVel()) for b in self.bodies])
 
 
 def _library():

@@ -49,6 +49,7 @@ class Ours(Engine):
     colour = "#0072B2"
     widths = ("float32", "float64")
     install = "pip install rbd-jax"
+    compiles = True
 
     @property
     def variants(self) -> dict[str, str]:

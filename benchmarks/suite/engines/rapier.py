@@ -10,12 +10,10 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import os
-from collections.abc import Callable
-
-import numpy as np
 
 from ..case import Case, Motion, Part
 from ..engine import Engine, Refused, Simulation
+from ._worlds import State, WorldByWorld, columns
 
 
 class RapierEngine(Engine):
@@ -37,38 +35,12 @@ class RapierEngine(Engine):
         return _Simulation(case, variant, dt)
 
 
-class _Simulation(Simulation):
+class _Simulation(WorldByWorld):
     def __init__(self, case: Case, variant: str, dt: float):
         self.rapier = _rapier()
         self.case, self.dt = case, dt
 
-    def motion(self, start: Motion, samples: int, steps_a_sample: int) -> Motion:
-        worlds = []
-        for world in range(start.pos.shape[1]):
-            engine, bodies = self._build()  # anew: contacts remember their impulses
-            self._reset(bodies, start, world)
-            states = [_state(bodies)]
-            for _ in range(samples):
-                for _ in range(steps_a_sample):
-                    engine.step()
-                states.append(_state(bodies))
-            worlds.append(states)
-        times = self.dt * steps_a_sample * np.arange(samples + 1)
-        return Motion(times, *(np.array(x).swapaxes(0, 1) for x in zip(*map(_columns, worlds), strict=True)))
-
-    def timer(self, start: Motion, steps: int) -> tuple[Callable[[], None], int, int]:
-        engine, bodies = self._build()
-
-        def call():
-            self._reset(bodies, start, 0)
-            step = engine.step
-            for _ in range(steps):
-                step()
-
-        return call, 1, steps
-
-    def _build(self):
-        """(world, its moving bodies)."""
+    def begin(self) -> None:
         rapier, case = self.rapier, self.case
         world = rapier.PhysicsWorld(tuple(map(float, case.gravity)))
         world.integration_parameters.dt = self.dt
@@ -76,7 +48,7 @@ class _Simulation(Simulation):
             plane = rapier.Collider.halfspace(tuple(map(float, normal))).translation(tuple(map(float, point)))
             world.add_collider(self._surface(plane))
         handles = [world.add_body(self._body(), [self._shape(part)]) for part in case.parts]
-        return world, [world.rigid_bodies[h] for h in handles]
+        self.world, self.bodies = world, [world.rigid_bodies[h] for h in handles]
 
     def _body(self):
         """Without damping and with gyroscopic forces, as is the default."""
@@ -96,26 +68,26 @@ class _Simulation(Simulation):
     def _surface(self, shape):
         return shape.friction(self.case.friction or 0.0).restitution(self.case.restitution or 0.0)
 
-    def _reset(self, bodies, start: Motion, world: int) -> None:
+    def place(self, start: Motion, world: int) -> None:
         rapier = self.rapier
-        for k, body in enumerate(bodies):
+        for k, body in enumerate(self.bodies):
             rotation = rapier.Rotation3(*start.quat[0, world, k].tolist())
             body.position = rapier.Isometry3(tuple(start.pos[0, world, k].tolist()), rotation)
             body.linvel = tuple(start.vel[0, world, k].tolist())
             body.angvel = tuple(start.omega[0, world, k].tolist())
 
+    def advance(self, steps: int) -> None:
+        step = self.world.step
+        for _ in range(steps):
+            step()
 
-def _state(bodies):
-    """(pos, quat, vel, omega) of every body."""
-    rows = []
-    for body in bodies:
-        turn = body.rotation
-        rows.append((tuple(body.translation), (turn.w, turn.i, turn.j, turn.k), tuple(body.linvel), tuple(body.angvel)))
-    return _columns(rows)
-
-
-def _columns(rows):
-    return tuple(np.array(c, np.float64) for c in zip(*rows, strict=True))
+    def state(self) -> State:
+        rows = []
+        for body in self.bodies:
+            turn = body.rotation
+            quat = (turn.w, turn.i, turn.j, turn.k)
+            rows.append((tuple(body.translation), quat, tuple(body.linvel), tuple(body.angvel)))
+        return columns(rows)
 
 
 def _rapier():
