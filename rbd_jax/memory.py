@@ -12,6 +12,8 @@ from .state import State
 
 #: Results smaller than this are not compared with what the machine has left [bytes].
 SMALL = 100_000_000
+#: A body's share of a state is less, in float64 [bytes]: what is smaller by this is not measured.
+MOST_A_BODY = 256
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,6 +87,8 @@ def refuse(state: State, worlds: int, samples: int, copies: int, devices=()) -> 
     Raises:
       MemoryError: naming what is needed, what there is and what to change.
     """
+    if worlds * samples * copies * (state.n + 1) * MOST_A_BODY < SMALL:
+        return
     own = math.prod(state.batch_shape)
     each = bytes_of(state._with(memory=None)) // own
     need = worlds * samples * each * copies

@@ -355,6 +355,8 @@ def batch_of(model: Model, batch: tuple[int, ...]) -> tuple[int, ...]:
     """
     for name, value in model.leaves():
         own = tuple(value.shape[: value.ndim - model.base_ndim(name)])
+        if not own:
+            continue
         k = max(len(own), len(batch))
         try:
             batch = np.broadcast_shapes(batch + (1,) * (k - len(batch)), own + (1,) * (k - len(own)))

@@ -116,11 +116,11 @@ def rollout(
             raise ValueError(f"rollout: {name} = {value!r} must be an integer >= {least}")
     blocks = blocks_of("rollout", checkpoint)
     truncate = None if truncate is None else int(truncate)
-    _check_state(model, state)
+    batch = _check_state(model, state)
     if callable(control):
         return _rollout_with(model, state, int(steps), int(every), control, blocks, truncate)
     _check_wrench(model, state, control)
-    steps, every, batch = int(steps), int(every), batch_of(model, state.batch_shape)
+    steps, every = int(steps), int(every)
     core = _forward(steps, every)
     use = means(core, (model, state, control), batch, steps)
     refuse(state, math.prod(batch), steps // every + 1, 1 + (use.cores > 1), use.devices)
@@ -155,7 +155,8 @@ def blocks_of(name: str, checkpoint) -> tuple[int, ...]:
     return tuple(int(size) for size in sizes)
 
 
-def _check_state(model: Model, state: State) -> None:
+def _check_state(model: Model, state: State) -> tuple[int, ...]:
+    """The batch axes of the worlds."""
     if not isinstance(model, Model) or not isinstance(state, State):
         raise TypeError("expected (model, state) as rbd_jax.build returns them")
     if state.n != model.n:
@@ -164,8 +165,10 @@ def _check_state(model: Model, state: State) -> None:
         raise ValueError(
             f"state is {state.x.x.dtype}, the model is {model.mass.dtype}: build both under the same jax_enable_x64"
         )
-    if 0 in batch_of(model, state.batch_shape):
+    batch = batch_of(model, state.batch_shape)
+    if 0 in batch:
         raise ValueError(f"batch size 0: the state has batch axes {state.batch_shape}; there is no world to step")
+    return batch
 
 
 def _check_wrench(model: Model, state: State, wrench) -> None:

@@ -2,7 +2,7 @@
 
 ``@struct`` registers a frozen dataclass: array fields are leaves, fields made with
 ``static()`` are part of the tree structure (they select the program and must be hashable).
-Unflattening bypasses ``__init__``, because JAX also unflattens with placeholders.
+JAX also unflattens with placeholders, so that ``__post_init__`` must not look at leaves.
 """
 
 from __future__ import annotations
@@ -25,24 +25,7 @@ def struct(cls: type[T]) -> type[T]:
     cls = dataclasses.dataclass(frozen=True, eq=False, repr=cls.__dict__.get("__repr__") is None)(cls)
     leaves = tuple(f.name for f in dataclasses.fields(cls) if not f.metadata.get("static"))
     fixed = tuple(f.name for f in dataclasses.fields(cls) if f.metadata.get("static"))
-    keys = tuple(jax.tree_util.GetAttrKey(name) for name in leaves)
-
-    def flatten_with_keys(obj):
-        children = tuple((k, getattr(obj, n)) for k, n in zip(keys, leaves))
-        return children, tuple(getattr(obj, n) for n in fixed)
-
-    def flatten(obj):
-        return tuple(getattr(obj, n) for n in leaves), tuple(getattr(obj, n) for n in fixed)
-
-    def unflatten(aux, children):
-        obj = object.__new__(cls)
-        for name, value in zip(leaves, children):
-            object.__setattr__(obj, name, value)
-        for name, value in zip(fixed, aux):
-            object.__setattr__(obj, name, value)
-        return obj
-
-    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
+    jax.tree_util.register_dataclass(cls, leaves, fixed)
 
     def _with(self, **changes):
         """Return a copy with the named fields changed (no validation)."""

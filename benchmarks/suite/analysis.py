@@ -22,6 +22,8 @@ BATCHES = ("1", "1024")
 BAR = 5.0
 #: A point belongs to the floor where no finer step fell by this order.
 FLAT = 0.25
+#: A finest step that gains less than this part of the order of the others has reached a floor.
+BENDS = 0.6
 #: A fit takes points above this many floors: nearer ones bend.
 CLEAR = 2.0
 #: Changes of a time and of an error up to these factors are not looked at.
@@ -138,9 +140,12 @@ def slope(dts: Sequence[float], errors: Sequence[float]) -> Slope | None:
     else:
         floor = float(errors[first - 1 :].min())
         above = (np.arange(len(dts)) < first) & (errors > CLEAR * floor) & (errors > 0)
-    used = int(above.sum())
-    fit = float(np.polyfit(np.log(dts[above]), np.log(errors[above]), 1)[0]) if used >= 3 else None
-    return Slope(fit, floor, used)
+    x, y = np.log(dts[above]), np.log(errors[above])
+    order_of = lambda x, y: float(np.polyfit(x, y, 1)[0])
+    while len(x) > 3 and (y[-2] - y[-1]) / (x[-2] - x[-1]) < BENDS * order_of(x[:-1], y[:-1]):
+        floor = float(errors.min()) if floor is None else floor  # the finest point has bent towards it
+        x, y = x[:-1], y[:-1]
+    return Slope(order_of(x, y) if len(x) >= 3 else None, floor, len(x))
 
 
 @dataclasses.dataclass(frozen=True)

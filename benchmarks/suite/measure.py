@@ -53,8 +53,8 @@ class Sweep:
         self.worlds = case.worlds
         self.cost = None  # seconds of a world and step
 
-    def load(self, dt):
-        return self.engine.load(self.case, self.variant, dt, self.dtype)
+    def load(self, dt, dtype=None):
+        return self.engine.load(self.case, self.variant, dt, dtype or self.dtype)
 
     def affordable(self, dt) -> bool:
         """Whether an error run fits the time; an engine that runs world by world may take fewer of them."""
@@ -65,9 +65,9 @@ class Sweep:
             self.worlds = max(min(self.worlds, int(self.job.error_s / (self.cost * steps))), 1)
         return self.cost * steps * self.worlds <= self.job.error_s
 
-    def run(self, dt) -> Motion:
+    def run(self, dt, dtype=None) -> Motion:
         case, steps = self.case, self.case.steps_a_sample(dt)
-        simulation = self.load(dt)
+        simulation = self.load(dt, dtype)
         start = case.start().worlds(self.worlds)
         if self.cost is None or self.engine.compiles:
             simulation.motion(start, 1, steps)  # another step may be another program
@@ -82,7 +82,7 @@ class Sweep:
         motion = simulation.motion(start, case.samples, steps)
         self.cost = (time.perf_counter() - begin) / (self.worlds * case.samples * steps)
         simulation.close()
-        check_start(motion, start, self.dtype)
+        check_start(motion, start, dtype or self.dtype)
         return motion
 
     def error(self, motion: Motion) -> dict:
@@ -178,7 +178,7 @@ def measure(job: Job, case: Case, engine: Engine, done: set, write, current) -> 
             if (variant, dtype, LIMIT) not in done and sweep.affordable(fine):
                 current((variant, dtype, LIMIT))
                 with contextlib.suppress(Exception):  # then the finest step is the limit
-                    limit = sweep.run(fine)
+                    limit = sweep.run(fine, engine.widths[-1])  # without the rounding of the narrower one
         for dt in job.steps:
             if (variant, dtype, dt) in done:
                 continue

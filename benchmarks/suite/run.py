@@ -124,9 +124,11 @@ def _job(job, choice, rows_file, same, say) -> None:
         reason = "time limit" if code is None else f"its process ended with {_words(code)}"
         if point is not None:
             variant, dtype, dt = point
-            row = {"kind": dt if dt == "limit" else "point", "case": job.case, "engine": job.engine, "variant": variant, "dtype": dtype,
-                   "dt": dt, "status": "skipped" if code is None else "failed", "reason": reason, "error": None,
-                   "self_error": None, "seconds": {}, "compile_s": {}}  # fmt: skip
+            row = {
+                "kind": dt if dt == "limit" else "point", "case": job.case, "engine": job.engine, "variant": variant,
+                "dtype": dtype, "dt": dt, "status": "skipped" if code is None else "failed", "reason": reason,
+                "error": None, "self_error": None, "seconds": {}, "compile_s": {},
+            }  # fmt: skip
             store.append(rows_file, {**same, **row})
         say(f"{job.case} in {job.engine}: {reason}")
         if code is None:
