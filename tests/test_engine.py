@@ -273,12 +273,15 @@ def test_control_constant_and_function(worlds):
 
 @pytest.mark.parametrize("shape", [rbd.Box((0.1, 0.2, 0.3)), rbd.Sphere(0.137)], ids=["box", "sphere"])
 def test_angular_momentum_survives_single_steps(shape):
-    """1e5 calls of step: omega is turned into L and back every time, L must not drift (f32)."""
+    """1e5 calls of step: omega is turned into L and back every time, L must not drift (f32).
+
+    Roundings of 6e-8 that lean one way would add up to 6e-3, those that do not walk 2e-5 away.
+    """
     scene = rbd.Scene(bodies=[rbd.Body("top", shape, omega=(1.0, 2.0, 3.0))], gravity=None, dt=0.005)
     model, state = rbd.build(scene, method="fast")
     many = jax.jit(lambda s: jax.lax.scan(lambda s, _: (rbd.step(model, s), None), s, None, length=100_000)[0])
     before, after = rbd.momentum(model, state)[1], rbd.momentum(model, many(state))[1]
-    assert float(jnp.linalg.norm(after - before) / jnp.linalg.norm(before)) < 1e-5
+    assert float(jnp.linalg.norm(after - before) / jnp.linalg.norm(before)) < 4e-5
 
 
 def test_diverged_world_is_frozen_and_its_neighbours_do_not_notice(worlds):
