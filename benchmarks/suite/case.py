@@ -96,7 +96,7 @@ class Case:
     distance: Callable | None
     steps: tuple[float, ...]
     features: frozenset
-    worlds: int = 16
+    worlds: int = 64
 
     def __post_init__(self):
         for dt in self.steps:

@@ -63,6 +63,10 @@ class Engine(abc.ABC):
     def version(self) -> str:
         return ""
 
+    def most(self, case: Case) -> int:
+        """Worlds at most that its programs are made for; errors are taken of no more."""
+        return case.worlds
+
     @abc.abstractmethod
     def load(self, case: Case, variant: str, dt: float, dtype: str) -> Simulation:
         """The case, ready to run.

@@ -50,34 +50,36 @@ class Sweep:
 
     def __init__(self, case: Case, engine: Engine, variant: str, dtype: str, job: Job):
         self.case, self.engine, self.variant, self.dtype, self.job = case, engine, variant, dtype, job
-        self.worlds = case.worlds
+        self.worlds = min(case.worlds, engine.most(case))
+        self.any_worlds = engine.any_number or not engine.scales
         self.cost = None  # seconds of a world and step
 
     def load(self, dt, dtype=None):
         return self.engine.load(self.case, self.variant, dt, dtype or self.dtype)
 
     def affordable(self, dt) -> bool:
-        """Whether an error run fits the time; an engine that runs world by world may take fewer of them."""
+        """Whether an error run fits the time; an engine without programs may take fewer worlds."""
         if self.cost is None:
             return True
         steps = self.case.steps_a_sample(dt) * self.case.samples
-        if not self.engine.scales:
+        if self.any_worlds:
             self.worlds = max(min(self.worlds, int(self.job.error_s / (self.cost * steps))), 1)
         return self.cost * steps * self.worlds <= self.job.error_s
 
     def run(self, dt, dtype=None) -> Motion:
         case, steps = self.case, self.case.steps_a_sample(dt)
         simulation = self.load(dt, dtype)
-        start = case.start().worlds(self.worlds)
+        all_worlds = case.start()
         if self.cost is None or self.engine.compiles:
-            simulation.motion(start, 1, steps)  # another step may be another program
+            few = all_worlds.worlds(min(self.worlds, os.cpu_count() or 1) if self.any_worlds else self.worlds)
+            simulation.motion(few, 1, steps)  # another step may be another program
         if self.cost is None:
             begin = time.perf_counter()
-            simulation.motion(start, 1, steps)
-            self.cost = (time.perf_counter() - begin) / (self.worlds * steps)
+            simulation.motion(few, 1, steps)
+            self.cost = (time.perf_counter() - begin) / (few.pos.shape[1] * steps)
             if not self.affordable(dt):
                 raise TooSlow
-            start = start.worlds(self.worlds)
+        start = all_worlds.worlds(self.worlds)
         begin = time.perf_counter()
         motion = simulation.motion(start, case.samples, steps)
         self.cost = (time.perf_counter() - begin) / (self.worlds * case.samples * steps)
@@ -103,9 +105,12 @@ class Sweep:
         try:
             whole = case.steps_a_sample(dt) * case.samples
             few = min(whole, 64)
-            if self.engine.any_number and batch > 1:
-                batch = max(2 * (os.cpu_count() or 1), min(batch, int(self.job.time_s / (self.cost * few))))
+            if self.engine.any_number:
+                if batch > 1:
+                    batch = max(2 * (os.cpu_count() or 1), min(batch, int(self.job.time_s / (self.cost * few))))
                 few = max(min(few, int(self.job.time_s / (self.cost * batch))), 1)
+            elif self.cost * batch * few > self.job.error_s:
+                batch = min(batch, self.worlds)  # whose program there is already
             start = case.start(min(batch, case.worlds)).worlds(batch)
             begin = time.perf_counter()
             call, worlds, steps = simulation.timer(start, few)
@@ -115,9 +120,10 @@ class Sweep:
             call()
             step = (time.perf_counter() - begin) / steps
             count = max(min(whole, int(self.job.time_s / step)), steps)
-            if count < whole and middle is not None:
+            part = count < whole and middle is not None
+            if part:
                 start = middle.worlds(batch)
-            if count != steps:
+            if part or count != steps:
                 call, worlds, steps = simulation.timer(start, count)
                 call()
             times = []
@@ -175,9 +181,10 @@ def measure(job: Job, case: Case, engine: Engine, done: set, write, current) -> 
         if case.distance is not None and motions:
             limit = motions[min(motions)]
             fine = min(motions) / FINER
-            if (variant, dtype, LIMIT) not in done and sweep.affordable(fine):
+            wanted = variant in job.both and (variant, dtype, LIMIT) not in done
+            if wanted and sweep.affordable(fine):
                 current((variant, dtype, LIMIT))
-                with contextlib.suppress(Exception):  # then the finest step is the limit
+                with contextlib.suppress(Exception):  # else the finest step is the limit
                     limit = sweep.run(fine, engine.widths[-1])  # without the rounding of the narrower one
         for dt in job.steps:
             if (variant, dtype, dt) in done:

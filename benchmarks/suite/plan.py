@@ -17,6 +17,14 @@ SMOKE = ("parabola", "elastic")
 SOLVED = ("slide", "incline", "column")
 
 
+#: Longest job of ``standard`` [s].
+LIMITS = {"ours": 300.0, "mujoco": 100.0, "mjx": 100.0, "brax": 100.0}
+#: Bodies of a scene from which on an error run and a job may take longer.
+LARGE = 64
+#: Made for batches, and slow to compile: one world of three bodies or more is left to ``full``.
+SLOW_ALONE = ("mjx", "brax")
+
+
 @dataclasses.dataclass(frozen=True)
 class Job:
     """What one process measures: a case in one engine.
@@ -76,8 +84,13 @@ def smoke(case, engine) -> Job:
 def standard(case, engine) -> Job:
     variants = ours(case, engine.variants) if engine.name == "ours" else others(engine, case)
     both = tuple(v for v, _ in variants if engine.name != "ours" or v.split("+")[0] in PRESETS)
-    limit = 300.0 if engine.name == "ours" else 120.0
-    return Job(case.name, engine.name, tuple(variants), case.steps, both, limit_s=limit)
+    batches = (1, 1024)
+    if engine.name in SLOW_ALONE and len(case.parts) > 2:
+        both, batches = (), (1024,)
+    large = len(case.parts) >= LARGE
+    error_s = 20.0 if large else 3.0
+    limit = LIMITS.get(engine.name, 60.0) * (2 if large and engine.name not in SLOW_ALONE else 1)
+    return Job(case.name, engine.name, tuple(variants), case.steps, both, batches, error_s, limit_s=limit)
 
 
 def full(case, engine) -> Job:

@@ -77,7 +77,7 @@ CASE = Case(
     restitution=None, gravity=G, starts=starts, seconds=SECONDS, samples=SAMPLES, truth=None,
     reference="our own run at 1/4000 s in float64, against 1/2000 s", bound=5e-3, error=error,
     unit="time at which the seventh falls, relative", distance=None, steps=STEPS,
-    features=frozenset({"contact", "friction", "attitude", "pairs"}), worlds=8,
+    features=frozenset({"contact", "friction", "attitude", "pairs"}),
 )  # fmt: skip
 CASES = (CASE,)
 

@@ -63,7 +63,7 @@ def moving(name, title, part, height, law):
         gravity=G, starts=lambda n, rng: _headed(n, rng, height), seconds=1.0, samples=10,
         truth=lambda start: law(start, sample_times(1.0, 10)), reference="closed form", bound=1e-14, error=travelled,
         unit="place after 1 s, over the way", distance=position, steps=STEPS,
-        features=frozenset({"contact", "friction", "attitude"}), worlds=64,
+        features=frozenset({"contact", "friction", "attitude"}),
     )  # fmt: skip
 
 

@@ -57,7 +57,7 @@ def bounce(name, title, e):
         gravity=G, starts=dropped, seconds=2.0, samples=20,
         truth=lambda start: bouncing(start, e, sample_times(2.0, 20)), reference="closed form", bound=1e-14,
         error=position, unit="height, root mean square over 2 s [m]", distance=position, steps=STEPS,
-        features=frozenset({"contact", "restitution"}), worlds=64,
+        features=frozenset({"contact", "restitution"}),
     )  # fmt: skip
 
 
@@ -105,7 +105,7 @@ OBLIQUE = Case(
     planes=GROUND, friction=MU_OBLIQUE, restitution=E_OBLIQUE, gravity=G, starts=struck, seconds=0.4, samples=4,
     truth=lambda start: glancing(start, sample_times(0.4, 4)), reference="closed form", bound=1e-14,
     error=last_velocity, unit="velocity and spin after the impact, relative", distance=position, steps=STEPS,
-    features=frozenset({"contact", "restitution", "friction", "attitude"}), worlds=64,
+    features=frozenset({"contact", "restitution", "friction", "attitude"}),
 )  # fmt: skip
 
 
@@ -146,7 +146,7 @@ SPHERES = Case(
     gravity=(0.0, 0.0, 0.0), starts=aimed, seconds=1.0, samples=10,
     truth=lambda start: colliding(start, sample_times(1.0, 10)), reference="closed form", bound=1e-14, error=position,
     unit="position, root mean square [m]", distance=position, steps=STEPS,
-    features=frozenset({"contact", "restitution", "pairs"}), worlds=64,
+    features=frozenset({"contact", "restitution", "pairs"}),
 )  # fmt: skip
 
 

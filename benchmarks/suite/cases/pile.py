@@ -40,7 +40,7 @@ def dropped(places, noise=0.01, turned=False):
     return starts
 
 
-def pile(name, title, parts, planes, starts, seconds=2.0, worlds=8):
+def pile(name, title, parts, planes, starts, seconds=2.0, worlds=64):
     return Case(
         name=name, title=title, group="pile", parts=tuple(parts), planes=planes, friction=MU, restitution=None,
         gravity=G, starts=starts, seconds=seconds, samples=2, truth=None, reference="rigid bodies do not overlap",
@@ -56,8 +56,8 @@ MIXED = [sphere(0.1), box((0.12, 0.1, 0.1)), sphere(0.1), box((0.1, 0.1, 0.1))] 
 
 CASES = (
     pile("pile16", "16 balls in a bin", *balls(16, 0.56, 2)),
-    pile("pile64", "64 balls in a bin", *balls(64, 0.94, 4), worlds=4),
+    pile("pile64", "64 balls in a bin", *balls(64, 0.94, 4), worlds=32),
     pile("heap216", "216 spheres collapse (\"666\")", [sphere(0.1)] * 216, GROUND,
-         dropped(lattice(216, 6, 0.21, 0.11, 0.21), 0.004), worlds=2),
+         dropped(lattice(216, 6, 0.21, 0.11, 0.21), 0.004), worlds=16),
     pile("clutter", "4 boxes and 4 balls in a bin", MIXED, bin_of(0.6), dropped(lattice(8, 2, 0.28, 0.16, 0.3))),
 )  # fmt: skip

@@ -118,7 +118,7 @@ class _Simulation(Simulation):
         return Motion(self.dt * steps_a_sample * np.arange(samples + 1), *columns)
 
     def timer(self, start, steps):
-        """On the CPU at most 256 worlds (64 of several bodies), and steps for a call of about 2 s."""
+        """On the CPU at most 256 worlds (64 of several bodies), and steps for a call of about 0.3 s."""
         worlds = fewer_worlds(start.pos.shape[1], self.most)
         state = self._first(start.worlds(worlds))
         run = lambda steps: jax.block_until_ready(self.program.advance(self.step, state, steps))

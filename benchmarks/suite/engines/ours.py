@@ -23,10 +23,10 @@ PRESETS = {
 }
 #: Impacts at their own instant, in any preset.
 EVENTS = 4
-#: Steps of one call where a program is dear to compile.
-CHUNK = 64
-#: A call of CHUNK steps of one world below this is compiled once more, at its whole length [s].
-CHEAP = 2e-3
+#: A call shorter than this [s] is made longer, so that the cost of calling (about 0.1 ms) is not what is measured.
+SHORT = 2e-3
+#: A program that compiles in less [s] is made for every number of steps that is asked for.
+QUICK = 2.0
 
 
 def _method(variant: str, case: Case) -> rbd.Method:
@@ -71,8 +71,8 @@ class Ours(Engine):
 
 
 @functools.cache
-def _length(key) -> list:
-    """[steps a call] of a program, found by its first timing; shared by all steps of a sweep."""
+def _cost(key) -> list:
+    """[seconds a step, seconds to compile] of a program and number of worlds, found by the first timing of a sweep."""
     return []
 
 
@@ -81,7 +81,7 @@ class _Simulation(Simulation):
         self.wide = dtype == "float64"
         self.key = (case.name, method, dtype)
         self.compile_s = {}
-        self.counts = [case.steps_a_sample(dt) for dt in case.steps]
+        self.counts, self.samples = [case.steps_a_sample(dt) for dt in case.steps], case.samples
         with self._width():
             try:
                 self.model, self.one = rbd.build(case.scene(), dt=dt, method=method)
@@ -113,18 +113,25 @@ class _Simulation(Simulation):
         with self._width():
             first = self._state(start)
         worlds = first.pos.shape[0]
-        length = _length((*self.key, worlds))
-        if not length:
-            few = min(CHUNK, steps)
+        sample = min(self.counts)  # steps between two samples at the coarsest step, which divide all others
+        lengths = [sample * self.samples, 10 * sample * self.samples]  # a program a step would take hours to compile
+        if worlds > 1:
+            lengths.insert(0, sample)
+        cost = _cost((*self.key, worlds))
+        if not cost:
             begin = time.perf_counter()
-            self._run(first, few, few)
+            self._run(first, lengths[0], lengths[0])
             self.compile_s[worlds] = time.perf_counter() - begin
             begin = time.perf_counter()
-            self._run(first, few, few)
-            cheap = time.perf_counter() - begin < CHEAP * max(1.0, worlds / 50)
-            length.append(None if cheap else CHUNK)
-        chunk = min(length[0] or steps, steps)
-        count = steps // chunk * chunk
+            self._run(first, lengths[0], lengths[0])
+            cost += (time.perf_counter() - begin) / lengths[0], self.compile_s[worlds]
+        chunk = lengths[0]
+        for longer in lengths[1:]:
+            if steps % longer == 0 and chunk * cost[0] < SHORT:
+                chunk = longer
+        if chunk * cost[0] < SHORT and cost[1] < QUICK:
+            chunk = steps
+        count = max(steps // chunk, 1) * chunk
         return functools.partial(self._run, first, count, chunk), worlds, count
 
     def _run(self, state, steps, chunk):
