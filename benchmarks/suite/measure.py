@@ -6,6 +6,7 @@ Run by ``run`` in a process of its own, so that a peer that crashes or hangs cos
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import os
 import pathlib
@@ -43,6 +44,12 @@ def spread(values) -> dict:
 
 class TooSlow(Exception):
     """An error run would take longer than it may."""
+
+
+@functools.lru_cache(maxsize=2)
+def truth_of(case: Case) -> Motion | None:
+    """Of all its worlds; some take a minute."""
+    return case.truth(case.start()) if case.truth else None
 
 
 class Sweep:
@@ -88,8 +95,8 @@ class Sweep:
         return motion
 
     def error(self, motion: Motion) -> dict:
-        start = self.case.start().worlds(motion.pos.shape[1])
-        truth = self.case.truth(start) if self.case.truth else None
+        truth = truth_of(self.case)
+        truth = truth and truth.worlds(motion.pos.shape[1])
         with np.errstate(all="ignore"):
             return spread(np.where(motion.finite, self.case.error(motion, truth, self.case), np.inf))
 

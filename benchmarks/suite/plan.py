@@ -88,7 +88,7 @@ def standard(case, engine) -> Job:
     if engine.name in SLOW_ALONE and len(case.parts) > 2:
         both, batches = (), (1024,)
     large = len(case.parts) >= LARGE
-    error_s = 20.0 if large else 3.0
+    error_s = 20.0 if large else 3.0 if engine.name == "ours" else 1.5
     limit = LIMITS.get(engine.name, 60.0) * (2 if large and engine.name not in SLOW_ALONE else 1)
     return Job(case.name, engine.name, tuple(variants), case.steps, both, batches, error_s, limit_s=limit)
 

@@ -99,7 +99,11 @@ class _Simulation(Simulation):
         with self._width():
             state = self._state(start)
             seen = [state]
-            chunk = math.gcd(steps_a_sample, *self.counts)  # one program for all steps of the sweep
+            chunk = math.gcd(steps_a_sample, *self.counts)  # two programs for all steps of the sweep
+            if steps_a_sample % (10 * chunk) == 0:
+                chunk *= 10
+            if not self.model.structure.groups:
+                chunk = steps_a_sample  # quick to compile
             for _ in range(samples):
                 for _ in range(steps_a_sample // chunk):
                     state = rbd.rollout(self.model, state, chunk, every=chunk)[0]
