@@ -13,6 +13,7 @@ from .convert import from_mujoco, to_mujoco
 from .diagnostics import Contacts, SimulationError, check, contacts, energy, inertia_world, momentum, wrench_at
 from .estimate import memory_estimate
 from .horizon import GradientNorms, gradient_norms
+from .longrun import long_rollout
 from .memory import MemoryEstimate
 from .method import PRESETS, Method
 from .mjcf import load_mjcf, to_mjcf
@@ -58,6 +59,7 @@ __all__ = [
     "gradient_norms",
     "inertia_world",
     "load_mjcf",
+    "long_rollout",
     "memory_estimate",
     "momentum",
     "rollout",

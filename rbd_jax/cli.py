@@ -103,6 +103,13 @@ def _number(rule: str, unit: str):
     return convert
 
 
+def _pixels(text: str) -> tuple[int, int]:
+    parts = text.split("x")
+    if len(parts) != 2:
+        raise argparse.ArgumentTypeError(f"{text!r} must be WIDTHxHEIGHT, as 480x320")
+    return _integer(2)(parts[0]), _integer(2)(parts[1])
+
+
 def _batches(text: str) -> list[int]:
     return [_integer(1)(part) for part in text.split(",")]
 
@@ -196,6 +203,24 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--png", metavar="FILE.png", help=f"write a picture of the end (the first {PICTURED} worlds)")
     sub.add_argument("--json", action="store_true", help="print the summary as JSON")
     sub.add_argument("--quiet", action="store_true", help="print nothing but warnings and errors")
+
+    sub = add(
+        "render",
+        _render,
+        "draw a scene, or a trajectory that run wrote: picture, movie, page, or a scene for another program",
+        "examples:\n"
+        "  rbd-jax render dominoes -o dominoes.gif --seconds 3\n"
+        "  rbd-jax render out.npz -o clip.mp4 --worlds 4\n\n"
+        "The ending of FILE says what is written: .png .gif .mp4 .html .glb (glTF) .usda (USD). No display needed.",
+    )
+    add_scene(sub, method="fast")
+    sub.add_argument("-o", "--out", required=True, metavar="FILE", help="what to write")
+    sub.add_argument("--seconds", type=_number("> 0", "s"), metavar="T", help=f"simulated [s] (default {SECONDS:g})")
+    sub.add_argument("--worlds", type=_integer(1), default=1, metavar="N", help="worlds side by side (default 1)")
+    add_noise(sub)
+    sub.add_argument("--fps", type=_number("> 0", "1/s"), default=25.0, metavar="F", help="of a movie (default 25)")
+    sub.add_argument("--speed", type=_number("> 0", "-"), default=1.0, metavar="X", help="of a movie (default 1)")
+    sub.add_argument("--size", type=_pixels, default=(480, 320), metavar="WxH", help="in pixels (default 480x320)")
 
     sub = add(
         "validate",
@@ -496,6 +521,61 @@ def _write(args, model, traj, title: str, notes: dict) -> list[str]:
         if args.png:
             write_png(film, args.png, world=range(min(film.shape[0], PICTURED)))
     return [p for p in (args.out, args.html, args.png) if p]
+
+
+def _render(args) -> int:
+    from .view import write_gif, write_glb, write_html, write_mp4, write_png, write_usda
+
+    movie = {"fps": args.fps, "speed": args.speed, "width": args.size[0], "height": args.size[1]}
+    still = {"width": args.size[0], "height": args.size[1]}
+    side = lambda film: range(film.shape[0])
+    writers = {
+        ".png": lambda film: write_png(film, args.out, world=side(film), **still),
+        ".gif": lambda film: write_gif(film, args.out, world=side(film), **movie),
+        ".mp4": lambda film: write_mp4(film, args.out, world=side(film), **movie),
+        ".html": lambda film: write_html(film, args.out),
+        ".glb": lambda film: write_glb(film, args.out),
+        ".usda": lambda film: write_usda(film, args.out),
+    }
+    ending = os.path.splitext(args.out)[1].lower()
+    if ending not in writers:
+        raise UsageError(
+            f"{args.out}: cannot write {ending or 'a file without an ending'}; known: {', '.join(writers)}"
+        )
+    _check_outputs(args.out)
+    with _user_errors():
+        film = _film_of_file(args) if args.scene.endswith(".npz") else _film_of_scene(args)
+        writers[ending](film)
+    return OK
+
+
+def _film_of_scene(args):
+    """A scene simulated now."""
+    import numpy as np
+
+    from .build import build
+    from .record import clip
+    from .rollout import rollout
+
+    scene, title = _scene(args.scene)
+    model, start = build(scene, dt=args.dt, method=args.method)
+    dt = float(str(np.asarray(model.dt)))
+    steps = max(1, round((args.seconds or SECONDS) / dt))
+    start = _worlds(model, start, args.worlds, args.perturb, args.seed)
+    _, traj = rollout(model, start, steps, every=max(1, round(1.0 / (SAMPLE_RATE * dt))))
+    return clip(model, traj, title=title, worlds=args.worlds)
+
+
+def _film_of_file(args):
+    """A trajectory that ``run --out`` wrote, of the scene that its header names."""
+    from .record import film, load
+
+    content = load(args.scene)
+    source = content["header"].get("scene")
+    if source is None:
+        raise UsageError(f"{args.scene}: its header does not name the scene")
+    scene, title = _scene(source)
+    return film(scene, content, title=title, worlds=args.worlds)
 
 
 def _summary(model, start, final, args, dt: float, compiled: float, ran: float) -> dict:

@@ -12,8 +12,10 @@ from typing import Any
 import jax
 import numpy as np
 
+from .build import build
 from .diagnostics import energy
 from .model import BASE_NDIM, Model, batch_of
+from .scene import Scene
 from .state import State
 from .tiles import flattened, per_world
 from .view import Clip
@@ -159,6 +161,29 @@ def clip(model: Model, traj: State, title: str = "rbd_jax", worlds: int = 16) ->
         energy=total[:, kept] if np.isfinite(total).all() else None,
         dynamic=model.n,
     )
+
+
+def film(scene: Scene, content: dict[str, Any], title: str = "rbd_jax", worlds: int = 16) -> Clip:
+    """The clip of a file that :func:`load` read, made from ``scene``; arguments as for :func:`clip`.
+
+    Raises:
+      ValueError: the bodies of the file are not those of the scene.
+    """
+    model, state = build(scene, method="fast")
+    for what in ("bodies", "kinematic"):
+        own, seen = list(getattr(model.names, what)), content[what].tolist()
+        if own != seen:
+            raise ValueError(f"the file has {what} {seen}, the scene {own}")
+    pos = content["pos"].reshape(-1, *content["pos"].shape[-3:])
+    shape = pos.shape[:2]
+    fields = ("pos", "vel", "quat", "omega")
+    fields += tuple(f"kinematic_{f}" for f in fields) if state.kinematic is not None else ()
+    rows = {f: content[f].reshape(*shape, *content[f].shape[-2:]) for f in fields}
+    grown = jax.tree.map(lambda c: np.broadcast_to(np.asarray(c), (*shape, *np.shape(c))), state._with(memory=None))
+    traj = grown.replace(**rows)
+    dt = np.float64(content["header"]["dt"])
+    step = np.broadcast_to(content["step"], content["pos"].shape[:-2]).reshape(shape)
+    return clip(model, traj._with(step=step, dt=np.broadcast_to(dt, shape)), title, worlds)
 
 
 def _geoms(model: Model) -> list[dict[str, Any]]:

@@ -394,3 +394,32 @@ def test_save_load(tmp_path):
     other.write_text("text")
     with pytest.raises(ValueError, match="not a trajectory file"):
         record.load(other)
+
+
+@pytest.mark.parametrize(
+    "ending, start", [("gif", b"GIF89a"), ("glb", b"glTF"), ("usda", b"#usda"), ("png", b"\x89PNG")]
+)
+def test_render_writes_what_the_ending_says(tmp_path, ending, start):
+    pytest.importorskip("PIL")
+    path = tmp_path / f"a.{ending}"
+    small = ["--seconds", "0.1", "--size", "48x32", "--fps", "20"]
+    assert cli.main(["render", "bouncing_balls", "-o", str(path), *small]) == 0
+    assert path.read_bytes().startswith(start)
+
+
+def test_render_takes_what_run_wrote(tmp_path, capsys):
+    out = str(tmp_path / "out.npz")
+    noise = ["--perturb", "0.01", "--quiet"]
+    assert (
+        cli.main(["run", "bouncing_balls", "--batch", "3", "--steps", "6", "--every", "3", "--out", out, *noise]) == 0
+    )
+    assert cli.main(["render", out, "-o", str(tmp_path / "a.usda"), "--worlds", "2"]) == 0
+    assert (tmp_path / "a.usda").read_text().count('def Xform "world_') == 2
+    for bad, message in (
+        (["render", out, "-o", str(tmp_path / "a.xyz")], "cannot write .xyz; known: .png, .gif"),
+        (["render", out, "-o", str(tmp_path / "no" / "a.png")], "does not exist"),
+        (["render", str(tmp_path / "none.npz"), "-o", str(tmp_path / "a.png")], "none.npz"),
+        (["render", "dominoes", "-o", str(tmp_path / "a.png"), "--size", "12"], "must be WIDTHxHEIGHT"),
+    ):
+        assert cli.main(bad) == 2
+        assert message in capsys.readouterr().err

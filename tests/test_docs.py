@@ -9,7 +9,7 @@ import sys
 import pytest
 
 ROOT = pathlib.Path(__file__).parents[1]
-PAGES = ("docs/performance.md",)
+PAGES = ("docs/performance.md", "docs/learning.md", "docs/long_runs.md")
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -37,6 +37,8 @@ LAYER = {
     "convert": 8,
     "horizon": 8,
     "parity": 9,
+    "learn": 9,
+    "longrun": 9,
     "record": 9,
     "suite": 9,
     "view": 9,
@@ -63,6 +65,7 @@ WITHIN = {
     ("audit", "rollout"),
     ("audit", "diagnostics"),
     ("parity", "record"),
+    ("longrun", "record"),
 }
 
 

@@ -367,3 +367,121 @@ def test_page_without_webgl_says_so(tmp_path):
     ]
     dom = subprocess.run(command, capture_output=True, text=True, timeout=120).stdout
     assert re.search(r'<div id="message" role="alert">This page needs WebGL2', dom)
+
+
+# --- movies, and scenes for other programs ---
+
+QUICK = {"fps": 10.0, "width": 48, "height": 32}
+
+
+def test_a_movie_has_one_camera_and_the_clips_length():
+    from rbd_jax.view import pictures
+
+    clip = moving(W=1, T=61, n=2)  # a second
+    shots = list(pictures(clip, **QUICK))
+    assert len(shots) == 11 and all(s.shape == (32, 48, 3) and s.dtype == np.uint8 for s in shots)
+    assert len(list(pictures(clip, **QUICK, speed=2.0))) == 6
+    corners = np.array([s[0, 0] for s in shots], int)  # the sky, where nothing moves
+    assert np.ptp(corners, 0).max() <= 2 and not np.array_equal(shots[0], shots[5])
+    for bad in ({"fps": 0.0}, {"speed": -1.0}, {"fps": float("nan")}):
+        with pytest.raises(ValueError, match="must be finite and > 0"):
+            next(pictures(clip, **bad))
+
+
+def test_gif_plays_what_was_drawn(tmp_path):
+    image = pytest.importorskip("PIL.Image")
+    from rbd_jax.view import pictures, write_gif
+
+    clip = moving(W=1, T=31, n=2)
+    write_gif(clip, tmp_path / "a.gif", **QUICK)
+    with image.open(tmp_path / "a.gif") as gif:
+        assert gif.n_frames == 6 and gif.info["duration"] == 100 and gif.info["loop"] == 0
+        for k, shot in enumerate(pictures(clip, **QUICK)):
+            gif.seek(k)
+            assert np.abs(np.asarray(gif.convert("RGB"), int) - shot).mean() < 6  # 256 colours
+
+
+def test_mp4_is_a_movie(tmp_path):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    from rbd_jax.view import write_mp4
+
+    write_mp4(moving(W=1, T=31, n=2), tmp_path / "a.mp4", fps=10.0, width=65, height=49)
+    frames, seconds = ffmpeg.count_frames_and_secs(str(tmp_path / "a.mp4"))
+    assert frames == 6 and seconds == pytest.approx(0.6, abs=0.11)
+    with pytest.raises(OSError, match="ffmpeg"):
+        write_mp4(moving(W=1, T=2, n=1), tmp_path / "nowhere" / "a.mp4", **QUICK)
+
+
+def glb_parts(data):
+    magic, version, length = struct.unpack_from("<III", data)
+    assert (magic, version, length) == (0x46546C67, 2, len(data)) and length % 4 == 0
+    size, kind = struct.unpack_from("<II", data, 12)
+    assert kind == 0x4E4F534A
+    tree = json.loads(data[20 : 20 + size])
+    blob_size, kind = struct.unpack_from("<II", data, 20 + size)
+    assert kind == 0x004E4942 and 28 + size + blob_size == len(data)
+    blob = data[28 + size :]
+
+    def read(k):
+        a = tree["accessors"][k]
+        view = tree["bufferViews"][a["bufferView"]]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[a["type"]]
+        dtype = {5126: "<f4", 5125: "<u4"}[a["componentType"]]
+        assert view["byteOffset"] % 4 == 0 and view["byteLength"] == a["count"] * width * 4
+        return np.frombuffer(blob, dtype, a["count"] * width, view["byteOffset"]).reshape(a["count"], width)
+
+    return tree, read
+
+
+def test_gltf_holds_the_motion():
+    from rbd_jax.view.gltf import glb
+
+    clip = moving(W=2, T=20, n=3)
+    tree, read = glb_parts(glb(clip))
+    nodes, (animation,) = tree["nodes"], tree["animations"]
+    assert nodes[0]["rotation"] == pytest.approx([-(0.5**0.5), 0, 0, 0.5**0.5])  # y is up in glTF
+    bodies = [k for k, x in enumerate(nodes) if x.get("name") in clip.names]
+    assert len(bodies) == 6 and len(animation["channels"]) == 12
+    for channel in animation["channels"]:
+        sampler = animation["samplers"][channel["sampler"]]
+        np.testing.assert_allclose(read(sampler["input"])[:, 0], clip.time - clip.time[0], atol=1e-6)
+        place = bodies.index(channel["target"]["node"])
+        w, k = divmod(place, 3)
+        values = read(sampler["output"])
+        if channel["target"]["path"] == "translation":
+            np.testing.assert_allclose(values, clip.pos[w, :, k], atol=1e-6)
+        else:
+            q = values[:, [3, 0, 1, 2]]
+            np.testing.assert_allclose(np.abs((q * clip.quat[w, :, k]).sum(-1)), 1, atol=1e-6)
+            assert ((q[1:] * q[:-1]).sum(-1) > 0).all()  # the short way round
+    for mesh in tree["meshes"]:  # triangles look outwards
+        part = mesh["primitives"][0]
+        points, normals = read(part["attributes"]["POSITION"]), read(part["attributes"]["NORMAL"])
+        faces = read(part["indices"]).reshape(-1, 3)
+        a, b, c = (points[faces[:, k]] for k in range(3))
+        area = np.cross(b - a, c - a)
+        wide = np.linalg.norm(area, axis=1) > 1e-9
+        assert ((area * normals[faces[:, 0]]).sum(-1)[wide] > 0).all()
+
+
+def test_usd_holds_the_motion():
+    from rbd_jax.view.usd import usda
+
+    clip = moving(W=2, T=5, n=2)
+    text = usda(clip)
+    assert text.startswith("#usda 1.0\n") and text.count("{") == text.count("}") and 'upAxis = "Z"' in text
+    tracks = re.findall(r"xformOp:translate.timeSamples = \{ (.*) \}", text)
+    assert len(tracks) == 4
+    for track, (w, k) in zip(tracks, [(0, 0), (0, 1), (1, 0), (1, 1)]):
+        rows = re.findall(r"([\d.e+-]+): \(([^)]*)\)", track)
+        np.testing.assert_allclose([float(t) for t, _ in rows], np.arange(5), atol=1e-6)
+        np.testing.assert_allclose([[float(x) for x in r.split(",")] for _, r in rows], clip.pos[w, :, k], atol=1e-7)
+    usd = pytest.importorskip("pxr.Usd")
+    stage = usd.Stage.CreateInMemory()
+    assert stage.GetRootLayer().ImportFromString(text)
+
+
+def test_names_are_identifiers_and_unique():
+    from rbd_jax.view.usd import _names
+
+    assert _names(["a b", "a_b", "", "7", "ä"]) == ["a_b", "a_b_2", "_", "_7", "__2"]

@@ -1,14 +1,29 @@
-"""Layer 9: pictures of a trajectory, without a GL driver (PNG) and without a network (HTML page)."""
+"""Layer 9: pictures, movies, scenes for other programs and pages of a trajectory; no GL driver, no network."""
 
 from __future__ import annotations
 
 import os
 
 from .clip import Clip
+from .gltf import write_glb
 from .html import write_html
+from .movie import pictures, write_gif, write_mp4
 from .png import encode_png, render, write_png
+from .usd import write_usda
 
-__all__ = ["Clip", "check_writable", "encode_png", "render", "write_html", "write_png"]
+__all__ = [
+    "Clip",
+    "check_writable",
+    "encode_png",
+    "pictures",
+    "render",
+    "write_gif",
+    "write_glb",
+    "write_html",
+    "write_mp4",
+    "write_png",
+    "write_usda",
+]
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:

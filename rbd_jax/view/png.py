@@ -77,13 +77,15 @@ def render(
     strip: int | Sequence[int] | None = None,
     azimuth: float = look.AZIMUTH,
     elevation: float = look.ELEVATION,
+    fits: Sequence[int] = (),
 ) -> np.ndarray:
     """Picture (height, width, 3) of uint8.
 
     ``world``: one index, or several to be shown side by side. ``frame``: the instant shown. ``frames``:
     further instants shown as ghosts, the earlier the fainter. ``strip``: that many instants, evenly spaced
     (or these instants), as panels from left to right with one camera; ``frame`` and ``frames`` are unused.
-    ``azimuth``, ``elevation`` [deg]: where the camera stands as seen from the scene.
+    ``azimuth``, ``elevation`` [deg]: where the camera stands as seen from the scene. ``fits``: instants that the
+    camera must fit too, though they are not shown: a movie has one camera.
     """
     if width < 1 or height < 1:
         raise ValueError(f"picture of {width} x {height} pixels: both must be at least 1")
@@ -104,7 +106,8 @@ def render(
         return np.concatenate(parts, 1)
     frame = clip.frame_index(frame)
     ghosts = sorted({clip.frame_index(f) for f in frames or ()} - {frame})
-    return _panel(clip, worlds, frame, ghosts, [*ghosts, frame], (width, height), azimuth, elevation)
+    framed = sorted({*ghosts, frame, *(clip.frame_index(f) for f in fits)})
+    return _panel(clip, worlds, frame, ghosts, framed, (width, height), azimuth, elevation)
 
 
 def encode_png(rgb: np.ndarray) -> bytes:
