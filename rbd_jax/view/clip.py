@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import html
 from collections.abc import Sequence
 from typing import Any
 
@@ -198,6 +199,14 @@ class Clip:
             STATIC_COLOUR if b < 0 else PALETTE[b % len(PALETTE)] if b < self.dynamic else KINEMATIC_COLOUR
             for b in self.body
         ]
+
+    def _repr_html_(self) -> str:
+        """In a notebook a clip plays where it is the value of a cell."""
+        from .html import page_of
+
+        page = html.escape(page_of(self), quote=True)
+        style = "width:100%;height:440px;border:0"
+        return f'<iframe srcdoc="{page}" style="{style}" title="{html.escape(self.title)}"></iframe>'
 
     def world_index(self, world: int) -> int:
         """``world`` checked, negative ones counted from the end."""

@@ -24,6 +24,11 @@ def write_html(clip: Clip, path: str | os.PathLike[str]) -> None:
     Positions are kept to 1/65534 of the range that the body's path spans, attitudes to 1e-4 rad,
     14 bytes a body and sample before compression.
     """
+    Path(path).write_text(page_of(clip), "utf-8")
+
+
+def page_of(clip: Clip) -> str:
+    """The text of that page."""
     head, blob = pack(clip)
     page = (HERE / "player.html").read_text("utf-8")
     parts = {
@@ -36,7 +41,7 @@ def write_html(clip: Clip, path: str | os.PathLike[str]) -> None:
     for mark, text in parts.items():
         before, after = page.split(mark)
         page = before + text + after
-    Path(path).write_text(page, "utf-8")
+    return page
 
 
 def pack(clip: Clip) -> tuple[dict, bytes]:
