@@ -18,6 +18,7 @@ from .memory import MemoryEstimate
 from .method import PRESETS, Method
 from .mjcf import load_mjcf, to_mjcf
 from .model import Model
+from .processes import gathered, my_worlds
 from .rollout import rollout, step
 from .scene import Body, Geom, Pair, Scene
 from .shapes import Box, Plane, Sphere
@@ -56,12 +57,14 @@ __all__ = [
     "contacts",
     "energy",
     "from_mujoco",
+    "gathered",
     "gradient_norms",
     "inertia_world",
     "load_mjcf",
     "long_rollout",
     "memory_estimate",
     "momentum",
+    "my_worlds",
     "rollout",
     "sdf",
     "step",

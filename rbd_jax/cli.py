@@ -266,6 +266,19 @@ def _parser() -> argparse.ArgumentParser:
     _add_suite(sub)
     sub.add_argument("--run", metavar="ID", help="only the rows of this run (default: the newest of each point)")
 
+    sub = add(
+        "train",
+        _train,
+        "learn a task by PPO, or by gradients through the simulator",
+        "example:\n  rbd-jax train push --seconds 20",
+    )
+    sub.add_argument("task", metavar="TASK", help="push, catch, balance or topple")
+    sub.add_argument("--learner", choices=("ppo", "through"), default="ppo", help="default ppo")
+    sub.add_argument("--seconds", type=_number("> 0", "s"), metavar="T", help="wall time (default 20 without --steps)")
+    sub.add_argument("--steps", type=_integer(1), metavar="N", help="control steps of all worlds")
+    sub.add_argument("--seed", type=_integer(0), default=0, metavar="N", help="default 0")
+    sub.add_argument("--json", action="store_true", help="print the result as JSON")
+
     summary = "versions, devices, extras, shipped examples and presets"
     sub = add("info", _info, summary, "example:\n  rbd-jax info --json")
     sub.add_argument("--json", action="store_true", help="print as JSON")
@@ -576,6 +589,41 @@ def _film_of_file(args):
         raise UsageError(f"{args.scene}: its header does not name the scene")
     scene, title = _scene(source)
     return film(scene, content, title=title, worlds=args.worlds)
+
+
+def _train(args) -> int:
+    import importlib
+
+    import jax
+
+    from .learn import make, training
+
+    with _user_errors():
+        task = make(args.task)
+    learner = importlib.import_module(f".learn.{args.learner}", __package__)
+    seconds = args.seconds if args.seconds or args.steps else 20.0
+    say = lambda p: print(
+        f"{p.steps:9d} control steps, {p.seconds:6.1f} s: return {p.mean_return:.2f}", file=sys.stderr
+    ) if p.episodes else None  # fmt: skip
+    try:
+        got, history = learner.train(task, jax.random.key(args.seed), seconds=seconds, steps=args.steps, report=say)
+    except ModuleNotFoundError as missing:
+        raise UsageError(f"train needs {missing.name}: pip install 'rbd-jax[rl]'") from None
+    key = jax.random.key(args.seed + 1)
+    result = {
+        "task": args.task, "learner": args.learner, "steps": history[-1].steps, "seconds": history[-1].seconds,
+        "learned": float(training.evaluate(task, got.policy, key).mean()),
+        "chance": float(training.evaluate(task, training.at_random(task), key).mean()),
+    }  # fmt: skip
+    if args.json:
+        print(_json(result))
+    else:
+        print(
+            "{task}: return {learned:.2f} after {steps} control steps and {seconds:.1f} s; chance {chance:.2f}".format(
+                **result
+            )
+        )
+    return OK
 
 
 def _summary(model, start, final, args, dt: float, compiled: float, ran: float) -> dict:

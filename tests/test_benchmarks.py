@@ -130,3 +130,13 @@ def test_speed_scripts_write_rows(tmp_path, script, page):
     assert page in (tmp_path / f"{script}.md").read_text()
     data = [*tmp_path.glob(f"{script}.json*")]
     assert data and "versions" in data[0].read_text()
+
+
+def test_learning_writes_rows(tmp_path):
+    pytest.importorskip("optax")
+    smoke("learning.py", tmp_path)
+    rows = [json.loads(line) for line in (tmp_path / "learning.jsonl").read_text().splitlines()]
+    speed = {r["engine"]: r for r in rows if r["row"] == "throughput"}
+    assert speed["ours"]["steps_per_s"] > 0 and speed["mujoco"]["steps_per_s"] > 0 and "brax" in " ".join(speed)
+    assert {"chance", "ppo"} <= {r["learner"] for r in rows if r["row"] == "curve"}
+    assert (tmp_path / "learning.md").exists()
