@@ -201,6 +201,10 @@ def _parser() -> argparse.ArgumentParser:
         "--html", metavar="FILE.html", help=f"write one page that plays offline (the first {SHOWN} worlds)"
     )
     sub.add_argument("--png", metavar="FILE.png", help=f"write a picture of the end (the first {PICTURED} worlds)")
+    sub.add_argument("--forces", action="store_true", help="with the forces of contact in the page")
+    sub.add_argument(
+        "--ghost", action="store_true", help="with MuJoCo's run of the same worlds as outlines in the page"
+    )
     sub.add_argument("--json", action="store_true", help="print the summary as JSON")
     sub.add_argument("--quiet", action="store_true", help="print nothing but warnings and errors")
 
@@ -500,7 +504,7 @@ def _run(args) -> int:
         summary.update(status=str(error).splitlines(), bad_worlds=len(error.worlds))
     notes = {"scene": args.scene, "seed": args.seed, "perturb": args.perturb, "every": every}
     try:
-        summary["written"] = _write(args, model, traj, title, notes)
+        summary["written"] = _write(args, model, traj, title, notes, _ghost(args, scene, model, start, traj, every))
     except OSError as error:
         print(f"{args.prog}: error: cannot write: {error}", file=sys.stderr)
         return FAILED
@@ -518,7 +522,7 @@ def _run(args) -> int:
     return OK
 
 
-def _write(args, model, traj, title: str, notes: dict) -> list[str]:
+def _write(args, model, traj, title: str, notes: dict, ghost=None) -> list[str]:
     """Write what was asked for and return the paths."""
     if traj is None:
         return []
@@ -528,7 +532,7 @@ def _write(args, model, traj, title: str, notes: dict) -> list[str]:
     if args.out:
         save(args.out, model, traj, **notes)
     if args.html or args.png:
-        film = clip(model, traj, title=title, worlds=SHOWN)
+        film = clip(model, traj, title=title, worlds=SHOWN, forces=args.forces, ghost=ghost)
         if args.html:
             write_html(film, args.html)
         if args.png:
@@ -624,6 +628,18 @@ def _train(args) -> int:
             )
         )
     return OK
+
+
+def _ghost(args, scene, model, start, traj, every: int):
+    """MuJoCo's run of the worlds that the page shows."""
+    if not (args.ghost and args.html) or traj is None:
+        return None
+    import jax
+
+    from .parity import ghost
+
+    shown = jax.tree.map(lambda c: c[:SHOWN], start)
+    return ghost(scene, model, shown, (traj.batch_shape[-1] - 1) * every, every)
 
 
 def _summary(model, start, final, args, dt: float, compiled: float, ran: float) -> dict:

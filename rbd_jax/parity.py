@@ -21,8 +21,10 @@ from .build import build
 from .convert import from_mujoco, to_mujoco
 from .diagnostics import contacts
 from .mjcf import compile_mujoco
+from .model import Model
 from .rollout import rollout, step
 from .scene import Scene
+from .state import State
 
 #: Level 1 and 2 must agree to this, relative to 1 + |value| (f64).
 EXACT = 1e-6
@@ -181,3 +183,36 @@ def _open_loop(mujoco, mj, data, scene, model, start, method, qpos, qvel, dt) ->
         away = np.asarray(to_mujoco(model, traj)[0])
         rows.append(Row("3 open loop", f'"{method}", another contact law', _relative(away, qpos), None, ""))
     return rows
+
+
+def ghost(scene: Scene, model: Model, start: State, steps: int, every: int) -> tuple[np.ndarray, np.ndarray]:
+    """MuJoCo's run of the scene from the worlds of ``start``, for :func:`rbd_jax.record.clip`.
+
+    Args:
+      start: any batch axes, which become one. steps, every: as those of the rollout beside it.
+
+    Returns:
+      Origins (worlds, samples, n, 3) and quaternions (worlds, samples, n, 4) of the bodies, dynamic ones first.
+    """
+    import mujoco
+
+    mj, data = compile_mujoco(scene)
+    mj.opt.timestep = float(np.asarray(model.dt).ravel()[0])
+    names = model.names.bodies + model.names.kinematic
+    rows = [mujoco.mj_name2id(mj, mujoco.mjtObj.mjOBJ_BODY, name) for name in names]
+    qpos, qvel = (np.asarray(a, float).reshape(-1, a.shape[-1]) for a in to_mujoco(model, start))
+    pos, quat = [], []
+    for world in range(len(qpos)):
+        mujoco.mj_resetData(mj, data)
+        if mj.nkey:
+            mujoco.mj_resetDataKeyframe(mj, data, 0)
+        data.qpos[: model.n * 7], data.qvel[: model.n * 6] = qpos[world], qvel[world]
+        mujoco.mj_forward(mj, data)
+        seen = [(data.xpos[rows].copy(), data.xquat[rows].copy())]
+        for _ in range(steps // every):
+            mujoco.mj_step(mj, data, every)
+            mujoco.mj_kinematics(mj, data)
+            seen.append((data.xpos[rows].copy(), data.xquat[rows].copy()))
+        pos.append([p for p, _ in seen])
+        quat.append([q for _, q in seen])
+    return np.array(pos), np.array(quat)

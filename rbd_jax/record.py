@@ -13,8 +13,9 @@ import jax
 import numpy as np
 
 from .build import build
-from .diagnostics import energy
+from .diagnostics import contacts, energy
 from .model import BASE_NDIM, Model, batch_of
+from .rollout import step
 from .scene import Scene
 from .state import State
 from .tiles import flattened, per_world
@@ -122,7 +123,7 @@ def first_worlds(model: Model, state: State, count: int, samples: bool = True) -
     return jax.tree.map(cut, model, own), jax.tree.map(cut, state)
 
 
-def clip(model: Model, traj: State, title: str = "rbd_jax", worlds: int = 16) -> Clip:
+def clip(model: Model, traj: State, title: str = "rbd_jax", worlds: int = 16, forces: bool = False, ghost=None) -> Clip:
     """What :func:`rbd_jax.view.write_html` and ``write_png`` draw: the first ``worlds`` worlds of a trajectory.
 
     Args:
@@ -131,6 +132,10 @@ def clip(model: Model, traj: State, title: str = "rbd_jax", worlds: int = 16) ->
         moves on (all frozen) are left out.
       title: of the page.
       worlds: at most so many.
+      forces: with the forces of contact: those of one more step from every sample, as a trajectory has no memory of its
+        own; warm starting is left out of them.
+      ghost: (pos, quat) of the origins of the bodies in another run (worlds, samples, n, 3 | 4), e.g. of
+        :func:`rbd_jax.parity.ghost`.
 
     Raises:
       ValueError: worlds < 1, or batch sizes of model and trajectory that do not match.
@@ -139,6 +144,10 @@ def clip(model: Model, traj: State, title: str = "rbd_jax", worlds: int = 16) ->
         raise ValueError(f"clip: worlds = {worlds} must be >= 1")
     model, traj = first_worlds(model, traj, worlds)
     total = np.asarray(sum(jax.jit(energy)(model, traj)))
+    pushes = None
+    if forces:
+        seen = jax.jit(lambda model, traj: contacts(model, step(model, traj)))(model, traj)
+        pushes = np.asarray(seen.point), np.where(seen.live[..., None], seen.force, np.nan)
     time = seconds(traj.step, traj.dt)
     time = time[np.argmax(time[:, -1])]  # a frozen world's clock stands still
     kept = np.flatnonzero(np.diff(time, prepend=-np.inf) > 0)
@@ -160,6 +169,8 @@ def clip(model: Model, traj: State, title: str = "rbd_jax", worlds: int = 16) ->
         title=title,
         energy=total[:, kept] if np.isfinite(total).all() else None,
         dynamic=model.n,
+        contacts=None if pushes is None else tuple(a[:, kept] for a in pushes),
+        ghost=None if ghost is None else tuple(np.asarray(a)[: len(pos), kept] for a in ghost),
     )
 
 

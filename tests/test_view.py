@@ -485,3 +485,71 @@ def test_names_are_identifiers_and_unique():
     from rbd_jax.view.usd import _names
 
     assert _names(["a b", "a_b", "", "7", "ä"]) == ["a_b", "a_b_2", "_", "_7", "__2"]
+
+
+# --- forces of contact and another run, on the page ---
+
+
+def with_marks():
+    """One ball on the ground, pressed by 10 N (and once by 20 N), and the same ball 0.5 m aside in another run."""
+    clip = still([(0, 0, 0.2)], [PLANE, sphere(0)])
+    pos, quat = np.repeat(clip.pos, 3, 1), np.repeat(clip.quat, 3, 1)
+    point = np.zeros((1, 3, 2, 3))
+    force = np.full((1, 3, 2, 3), np.nan)
+    force[0, :, 0] = [[0, 0, 10], [0, 0, 20], [0, 0, 10]]
+    force[0, 1, 1] = 0.0  # touches and carries nothing
+    return Clip(
+        [PLANE, sphere(0)], [0.0, 0.5, 1.0], pos, quat, contacts=(point, force), ghost=(pos + [0.5, 0, 0], quat)
+    )
+
+
+def test_page_holds_contacts_and_ghost(tmp_path):
+    write_html(with_marks(), tmp_path / "a.html")
+    head, arrays, _, _ = decode_page((tmp_path / "a.html").read_text("utf-8"))
+    assert arrays["contact_first"].tolist() == [0, 1, 2, 3]
+    scale = arrays["contact_scale"]
+    np.testing.assert_allclose(scale[6] * arrays["contact_force"], [[0, 0, 10], [0, 0, 20], [0, 0, 10]], atol=1e-3)
+    np.testing.assert_allclose(scale[:3] + scale[3:6] * arrays["contact_point"], 0, atol=1e-9)
+    np.testing.assert_allclose(arrays["ghost_pos_mid"][0, 0], [0.5, 0, 0.2], atol=1e-6)
+    plain = moving()
+    write_html(plain, tmp_path / "b.html")
+    assert not {"contact_first", "ghost_pos"} & set(decode_page((tmp_path / "b.html").read_text("utf-8"))[0]["arrays"])
+    for bad in (
+        {"contacts": (np.zeros((1, 2, 1, 3)),) * 2},
+        {"ghost": (np.zeros((1, 1, 1, 3)), np.ones((1, 1, 1, 4)))},
+    ):
+        with pytest.raises(ValueError, match="clip: (contacts|ghost)"):
+            Clip([sphere(0)], [0.0, 1.0, 2.0], np.zeros((1, 3, 1, 3)), np.tile([1.0, 0, 0, 0], (1, 3, 1, 1)), **bad)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium on PATH")
+def test_marks_are_drawn_in_chromium(tmp_path):
+    write_html(with_marks(), tmp_path / "a.html")
+    software = "--use-angle=swiftshader", "--enable-unsafe-swiftshader"
+    seen = {}
+    for name, marks in (("all", "&trails=1"), ("none", "&contacts=0&ghost=0")):
+        page = f"{tmp_path}/a.html#play=0{marks}"
+        seen[name], said = browse(page, tmp_path / f"{name}.png", *software)
+        assert said == []
+    red = [like(picture[60:330], (179, 38, 30), 0.1).sum() for picture in seen.values()]
+    black = [like(picture[60:330], (29, 39, 51), 0.1).sum() for picture in seen.values()]
+    assert red[0] > 20 and red[1] == 0, red  # the arrow
+    assert black[0] > black[1] + 20, black  # the outline
+
+
+def test_forces_of_a_ball_at_rest_are_its_weight():
+    import rbd_jax as rbd
+    from rbd_jax.parity import ghost
+    from rbd_jax.record import clip
+
+    ball = rbd.Body("ball", rbd.Sphere(0.1), pos=(0, 0, 0.1), vel=(0, 0, 0), mass=2.0)
+    scene = rbd.Scene(bodies=[ball], static=[rbd.Plane()], dt=0.005)
+    model, state = rbd.build(scene, method="fast")
+    states = rbd.batch(state, 2)
+    _, traj = rbd.rollout(model, states, 20, every=10)
+    film = clip(model, traj, forces=True, ghost=ghost(scene, model, states, 20, 10))
+    points, forces = film.contacts
+    assert points.shape == forces.shape == (2, 3, 1, 3)
+    np.testing.assert_allclose(forces[:, 1:, 0], np.broadcast_to([0, 0, 2 * 9.81], (2, 2, 3)), rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(points[:, 1:, 0], 0, atol=1e-3)
+    assert film.ghost[0].shape == (2, 3, 1, 3) and abs(film.ghost[0][0, -1, 0, 2] - 0.1) < 2e-3

@@ -52,6 +52,8 @@ class Clip:
     ``n`` bodies, dynamic ones first, then kinematic ones; a geom is at ``pos + R(quat) geom_pos``.
     ``dynamic``: how many of the n are dynamic (default: all). ``names``: of the n bodies.
     ``worlds``: names of worlds (default 'world 0', ...). ``energy`` (W, T) in joules, optional.
+    ``contacts``, optional: (points (W, T, c, 3) [m], forces (W, T, c, 3) [N]), a force of NaN where there is none.
+    ``ghost``, optional: (pos, quat) of the same bodies in another run, shown as outlines. Both on the page only.
     """
 
     geoms: Sequence[dict[str, Any]]
@@ -63,6 +65,8 @@ class Clip:
     energy: Any = None
     dynamic: int | None = None
     worlds: Sequence[str] | None = None
+    contacts: Any = None
+    ghost: Any = None
 
     def __post_init__(self):
         self.time = _finite("time", self.time)
@@ -91,6 +95,16 @@ class Clip:
         self.dynamic = n if self.dynamic is None else int(self.dynamic)
         if not 0 <= self.dynamic <= n:
             raise ValueError(f"clip: dynamic = {self.dynamic} must be 0..{n}")
+        if self.contacts is not None:
+            points, forces = (np.asarray(a, np.float64) for a in self.contacts)
+            if points.shape != forces.shape or points.ndim != 4 or points.shape[:2] != (W, T) or points.shape[3] != 3:
+                raise ValueError(f"clip: contacts {points.shape}, {forces.shape} must both be {(W, T)} + (c, 3)")
+            self.contacts = points, forces
+        if self.ghost is not None:
+            pos, quat = _finite("ghost pos", self.ghost[0]), _finite("ghost quat", self.ghost[1])
+            if pos.shape != self.pos.shape or quat.shape != self.quat.shape:
+                raise ValueError(f"clip: ghost {pos.shape}, {quat.shape} must be {self.pos.shape}, {self.quat.shape}")
+            self.ghost = pos, quat / np.linalg.norm(quat, axis=-1, keepdims=True)
         self.names = _labels("names", self.names, n, "body")
         self.worlds = _labels("worlds", self.worlds, W, "world")
         self.kind = [g["kind"] for g in self.geoms]

@@ -53,22 +53,17 @@ def pack(clip: Clip) -> tuple[dict, bytes]:
     W, T, n = clip.shape
     worlds, frames = range(W), np.unique(np.linspace(0, T - 1, min(T, 60)).round().astype(int))
     lo, hi = clip.frame(worlds, frames)
-    pos = clip.pos.transpose(0, 2, 3, 1)
-    mid = (pos.max(-1) + pos.min(-1)) / 2
-    step = np.maximum((pos.max(-1) - pos.min(-1)) / 2 / FULL, 1e-12)
-    quat = _continuous(clip.quat).transpose(0, 2, 3, 1)
-    # float32 first in use: quantise against the numbers that the page will read
-    mid, step = mid.astype(np.float32), step.astype(np.float32)
     arrays = {
         "time": clip.time.astype(np.float64),
-        "pos_mid": mid,
-        "pos_step": step,
         "geom_size": _shared(clip.geom_size).astype(np.float32),
         "geom_pos": _shared(clip.geom_pos).astype(np.float32),
         "geom_quat": _shared(clip.geom_quat).astype(np.float32),
-        "pos": _differences((pos - mid[..., None]) / step[..., None]),
-        "quat": _differences(quat * FULL),
+        **_poses("", clip.pos, clip.quat),
     }
+    if clip.ghost is not None:
+        arrays |= _poses("ghost_", *clip.ghost)
+    if clip.contacts is not None:
+        arrays |= _contacts(*clip.contacts)
     if clip.energy is not None:
         arrays["energy"] = clip.energy.astype(np.float32)
     table, offset = {}, 0
@@ -79,6 +74,7 @@ def pack(clip: Clip) -> tuple[dict, bytes]:
     raw = b"".join(a.tobytes().ljust(-(-a.nbytes // 8) * 8, b"\0") for a in arrays.values())
     head = {
         "title": clip.title,
+        "ghost": "MuJoCo",
         "shape": [W, T, n],
         "dynamic": clip.dynamic,
         "names": clip.names,
@@ -97,6 +93,47 @@ def pack(clip: Clip) -> tuple[dict, bytes]:
         "arrays": table,
     }
     return head, zlib.compress(raw, 9)
+
+
+def _poses(prefix: str, pos: np.ndarray, quat: np.ndarray) -> dict[str, np.ndarray]:
+    """Poses (W, T, n, 3 | 4) as int16 in units of the body's own path."""
+    pos = pos.transpose(0, 2, 3, 1)
+    mid = (pos.max(-1) + pos.min(-1)) / 2
+    step = np.maximum((pos.max(-1) - pos.min(-1)) / 2 / FULL, 1e-12)
+    quat = _continuous(quat).transpose(0, 2, 3, 1)
+    # float32 first in use: quantise against the numbers that the page will read
+    mid, step = mid.astype(np.float32), step.astype(np.float32)
+    return {
+        f"{prefix}pos_mid": mid,
+        f"{prefix}pos_step": step,
+        f"{prefix}pos": _differences((pos - mid[..., None]) / step[..., None]),
+        f"{prefix}quat": _differences(quat * FULL),
+    }
+
+
+def _contacts(points: np.ndarray, forces: np.ndarray) -> dict[str, np.ndarray]:
+    """The contacts that carry a force, one after the other: those of world w, instant t are ``contact_first[w T + t]``
+    to the next entry. Points in steps of the range they span, forces in steps of the largest component.
+
+    ``contact_scale``: middle (3) and step (3) of the points, step of the forces, and the force that is drawn long: the
+    95th percentile of all.
+    """
+    live = np.isfinite(forces).all(-1) & (np.abs(np.nan_to_num(forces)).max(-1) > 0)
+    first = np.concatenate([[0], np.cumsum(live.sum(-1).ravel())])
+    points, forces = points[live], forces[live]
+    if not len(points):
+        return {}
+    mid = (points.max(0) + points.min(0)) / 2
+    step = np.maximum((points.max(0) - points.min(0)) / 2 / FULL, 1e-12)
+    push = np.abs(forces).max() / FULL
+    long = np.percentile(np.linalg.norm(forces, axis=-1), 95)
+    whole = lambda a: np.rint(a).astype(np.int16)
+    return {
+        "contact_first": first.astype(np.float64),
+        "contact_scale": np.array([*mid, *step, push, long]),
+        "contact_point": whole((points - mid) / step),
+        "contact_force": whole(forces / push),
+    }
 
 
 def _shared(a: np.ndarray) -> np.ndarray:

@@ -26,7 +26,7 @@ async function unpack() {
   const data = {};
   for (const [name, { type, shape, offset }] of Object.entries(head.arrays))
     data[name] = new types[type](buffer, offset, shape.reduce((a, b) => a * b, 1));
-  for (const a of [data.pos, data.quat])  // running sums; Int16Array wraps as the writer assumes
+  for (const a of [data.pos, data.quat, data.ghost_pos, data.ghost_quat].filter(Boolean))  // running sums; Int16Array wraps as the writer assumes
     for (let i = 0; i < a.length; i += T) for (let t = 1; t < T; t++) a[i + t] += a[i + t - 1];
   return data;
 }
@@ -263,6 +263,7 @@ const number = (key, fallback, lo, hi) => {
 };
 const state = {
   t: 0, playing: false, speed: number("speed", 1, 0.01, 100), loop: true, layout: "one",
+  trails: options.get("trails") === "1", contacts: options.get("contacts") !== "0", ghost: options.get("ghost") !== "0",
   world: Math.round(number("world", 0, 0, W - 1)), count: counts.find((k) => k >= 9) || counts[counts.length - 1] || 1,
   follow: Math.round(number("follow", head.follow, -1, n - 1)),
   azimuth: head.view[1] * Math.PI / 180, elevation: head.view[2] * Math.PI / 180, distance: 1, target: [0, 0, 0],
@@ -310,14 +311,18 @@ function sampleAt(t) {
   }
   return [lo, (t - data.time[lo]) / (data.time[hi] - data.time[lo])];
 }
-function bodyPose(w, b, i, s) {
-  const j = Math.min(i + 1, T - 1), row = w * n + b, p = [0, 0, 0];
+function bodyPlace(w, b, i, s, run = "") {
+  const j = Math.min(i + 1, T - 1), row = w * n + b, p = [0, 0, 0], pos = data[run + "pos"];
   for (let k = 0; k < 3; k++) {
     const o = (3 * row + k) * T;
-    const q = data.pos[o + i] + s * (data.pos[o + j] - data.pos[o + i]);
-    p[k] = data.pos_mid[3 * row + k] + data.pos_step[3 * row + k] * q;
+    const q = pos[o + i] + s * (pos[o + j] - pos[o + i]);
+    p[k] = data[run + "pos_mid"][3 * row + k] + data[run + "pos_step"][3 * row + k] * q;
   }
-  const sample = (t) => [0, 1, 2, 3].map((k) => data.quat[(4 * row + k) * T + t]);
+  return p;
+}
+function bodyPose(w, b, i, s, run = "") {
+  const j = Math.min(i + 1, T - 1), row = w * n + b, p = bodyPlace(w, b, i, s, run);
+  const sample = (t) => [0, 1, 2, 3].map((k) => data[run + "quat"][(4 * row + k) * T + t]);
   const a = sample(i), b4 = sample(j), la = Math.hypot(...a) || 1, lb = Math.hypot(...b4) || 1;
   return [p, slerp(a.map((v) => v / la), b4.map((v) => v / lb), s)];
 }
@@ -484,6 +489,83 @@ function draw() {
   showTime();
 }
 
+const TRAIL = 240;  // points of a trail
+const EDGES = [0, 1, 2].flatMap((axis) => [0, 1, 2, 3].map((k) => [-1, 1].map((end) => {
+  const p = [0, 0, 0];
+  p[axis] = end;
+  p[(axis + 1) % 3] = k & 1 ? 1 : -1;
+  p[(axis + 2) % 3] = k & 2 ? 1 : -1;
+  return p;
+})));
+
+/** Trails, forces of contact and the other run, over the picture: nothing hides them. */
+function drawMarks(x, o, list, c, view) {
+  const seen = (p) => {  // [x, y, distance from the eye] of a point; null behind it
+    const k = [0, 1, 3].map((r) => view[r] * p[0] + view[4 + r] * p[1] + view[8 + r] * p[2] + view[12 + r]);
+    return k[2] > 0 ? [(k[0] / k[2] + 1) / 2 * o.clientWidth, (1 - k[1] / k[2]) / 2 * o.clientHeight, k[2]] : null;
+  };
+  const line = (points) => {
+    let pen = false;
+    x.beginPath();
+    for (const p of points) {
+      if (p) x[pen ? "lineTo" : "moveTo"](p[0], p[1]);
+      pen = !!p;
+    }
+    x.stroke();
+  };
+  const [i, s] = sampleAt(state.t), now = s > 0.5 ? Math.min(i + 1, T - 1) : i;
+  x.lineCap = x.lineJoin = "round";
+  if (state.trails) for (const { w, at } of list) for (let b = 0; b < head.dynamic; b++) {
+    const stride = Math.max(1, Math.ceil(i / TRAIL)), g = head.body.indexOf(b);
+    const path = [];
+    for (let t = 0; t <= i; t += stride) path.push(seen(add(bodyPlace(w, b, t, 0), at)));
+    path.push(seen(add(bodyPlace(w, b, i, s), at)));
+    x.strokeStyle = state.layout === "overlay" ? head.palette[w % head.palette.length] : g < 0 ? "#5b6775" : head.colour[g];
+    x.lineWidth = 1.5;
+    x.globalAlpha = 0.75;
+    line(path);
+  }
+  x.globalAlpha = 1;
+  if (state.ghost && data.ghost_pos) {
+    x.strokeStyle = "#1d2733";
+    x.lineWidth = 1.2;
+    x.setLineDash([4, 3]);
+    for (const { w, at } of list) {
+      const bodies = [...Array(n).keys()].map((b) => bodyPose(w, b, i, s, "ghost_"));
+      for (let g = 0; g < G; g++) {
+        if (head.body[g] < 0 || head.kind[g] === "plane") continue;
+        const [p, turn] = geomPose(bodies, w, g), size = ofGeom("geom_size", 3, w, g), place = add(p, at);
+        if (head.kind[g] === "box") {
+          for (const edge of EDGES) line(edge.map((e) => seen(add(place, rotate(turn, e.map((v, k) => v * size[k]))))));
+          continue;
+        }
+        const m = seen(place);
+        if (!m) continue;
+        x.beginPath();
+        x.arc(m[0], m[1], size[0] / m[2] / c.tanY * o.clientHeight / 2, 0, 2 * Math.PI);
+        x.stroke();
+      }
+    }
+    x.setLineDash([]);
+  }
+  if (state.contacts && data.contact_first) {
+    const q = data.contact_scale, reach = 0.22 * radiusOf(one);
+    for (const { w, at } of list)
+      for (let k = data.contact_first[w * T + now]; k < data.contact_first[w * T + now + 1]; k++) {
+        const place = add([0, 1, 2].map((d) => q[d] + q[3 + d] * data.contact_point[3 * k + d]), at);
+        const force = [0, 1, 2].map((d) => q[6] * data.contact_force[3 * k + d]), size = norm(force);
+        const from = seen(place), to = seen(add(place, force, reach * Math.min(size / q[7], 3) / (size || 1)));
+        if (!from || !to) continue;
+        x.strokeStyle = x.fillStyle = "#b3261e";
+        x.lineWidth = 2;
+        line([from, to]);
+        x.beginPath();
+        x.arc(from[0], from[1], 2.5, 0, 2 * Math.PI);
+        x.fill();
+      }
+  }
+}
+
 function drawOverlay(ratio, list, places, c, view) {
   const o = $("overlay"), x = o.getContext("2d");
   x.setTransform(ratio, 0, 0, ratio, 0, 0);
@@ -491,6 +573,7 @@ function drawOverlay(ratio, list, places, c, view) {
   x.font = "12px system-ui, sans-serif";
   x.textAlign = "center";
   x.textBaseline = "middle";
+  drawMarks(x, o, list, c, view);
   if (state.layout === "grid") list.forEach(({ w, at }, index) => {
     // below what the world shows now
     const lo = add(add(one.lo, at), add(one.hi, one.lo, -1), -0.2), hi = add(add(one.hi, at), add(one.hi, one.lo, -1), 0.2);
@@ -673,6 +756,14 @@ function wire() {
   $("play").onclick = () => play(!state.playing);
   $("scrub").oninput = () => seek(Number($("scrub").value));
   $("speed").onchange = () => setSpeed(Number($("speed").value));
+  $("contacts-label").hidden = !data.contact_first;
+  $("ghost-label").hidden = !data.ghost_pos;
+  $("ghost-name").textContent = head.ghost;
+  $("trails-label").hidden = T < 2 || head.dynamic < 1;
+  for (const name of ["trails", "contacts", "ghost"]) {
+    $(name).checked = state[name];
+    $(name).onchange = () => { state[name] = $(name).checked; dirty = true; };
+  }
   $("loop").onchange = () => { state.loop = $("loop").checked; };
   $("count").onchange = () => { state.count = Number($("count").value); legend(); fit(); };
   $("pick").onchange = () => setWorld(Number($("pick").value));
@@ -699,6 +790,7 @@ function wire() {
     ArrowLeft: (e) => stepFrames(e.shiftKey ? -10 : -1), ArrowRight: (e) => stepFrames(e.shiftKey ? 10 : 1),
     ArrowUp: () => speedStep(1), ArrowDown: () => speedStep(-1),
     "[": () => setWorld(state.world - 1), "]": () => setWorld(state.world + 1),
+    t: () => $("trails").click(), c: () => $("contacts").click(), o: () => $("ghost").click(),
     g: () => setLayout({ one: "grid", grid: "overlay", overlay: "one" }[state.layout]), f: fit, "?": () => $("help").click(),
   };
   window.addEventListener("keydown", (event) => {
