@@ -299,8 +299,7 @@ def draw(rows, path: pathlib.Path) -> None:
             if chance is not None:
                 ax.axhline(chance, color="0.5", ls=":", lw=1, label="chance")
             ax.set_xlabel("wall time of learning [s]" if key else "control steps")
-            if not key:
-                ax.set_xscale("log")
+            ax.set_xscale("log")
             ax.grid(alpha=0.3)
         column[0].set_title(task)
     for row in axes:
@@ -317,6 +316,7 @@ def main(argv=None) -> int:
         "--tasks", default=",".join(TASKS), metavar="A,B", help=f"of curves; default all: {','.join(TASKS)}"
     )
     parser.add_argument("--seeds", type=int, default=5, metavar="N", help="of curves (default 5)")
+    parser.add_argument("--report", action="store_true", help="run nothing, write the page and the chart")
     args = parser.parse_args(argv)
     wanted, tasks = args.rows.split(","), args.tasks.split(",")
     for given, known, what in ((wanted, ROWS, "row"), (tasks, TASKS, "task")):
@@ -330,7 +330,7 @@ def main(argv=None) -> int:
         "throughput": lambda: throughput(args.smoke, 1 if args.smoke else args.repeats),
         "curves": lambda: curves(args.smoke, tasks, args.seeds),
     }
-    for name in wanted:
+    for name in wanted if not args.report else ():
         for row in parts[name]():
             common.append_lines(out / "learning.jsonl", [{**row, **same}])
     rows = [json.loads(line) for line in (out / "learning.jsonl").read_text().splitlines()]
