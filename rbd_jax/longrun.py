@@ -22,7 +22,7 @@ import jax
 import numpy as np
 
 from .model import Model, batch_of
-from .record import seconds, versions
+from .record import seconds, versions, whole_or_not_at_all
 from .rollout import rollout
 from .state import State
 from .status import Status
@@ -204,16 +204,8 @@ def save_checkpoint(path: str | os.PathLike[str], state: State, notes: dict[str,
 
     header = {"format": FORMAT, "kind": "checkpoint", "rbd_jax": __version__, "versions": versions(), **notes}
     leaves = {f"leaf{k}": np.asarray(leaf) for k, leaf in enumerate(jax.tree.leaves(state))}
-    aside = f"{os.fspath(path)}.{os.getpid()}.part"
-    try:
-        with open(aside, "wb") as file:
-            np.savez(file, header=np.array(json.dumps(header)), **leaves)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(aside, path)
-    finally:
-        with contextlib.suppress(FileNotFoundError):
-            os.remove(aside)
+    with whole_or_not_at_all(path) as file:
+        np.savez(file, header=np.array(json.dumps(header)), **leaves)
 
 
 def load_checkpoint(path: str | os.PathLike[str], like: State) -> tuple[State, dict[str, Any]]:

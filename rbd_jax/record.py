@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import platform
+from collections.abc import Iterator
 from importlib import metadata
 from typing import Any
 
@@ -76,10 +77,19 @@ def save(path: str | os.PathLike[str], model: Model, traj: State, **notes: Any) 
     for name, labels in (("bodies", names.bodies), ("kinematic", names.kinematic), ("geoms", names.geoms)):
         arrays[name] = np.array(labels, dtype=np.str_)
     arrays["header"] = np.array(json.dumps(header))
+    with whole_or_not_at_all(path) as file:
+        np.savez(file, **arrays)
+
+
+@contextlib.contextmanager
+def whole_or_not_at_all(path: str | os.PathLike[str]) -> Iterator[Any]:
+    """A file to write into that takes the place of ``path`` once it is complete and on the disk."""
     aside = f"{os.fspath(path)}.{os.getpid()}.part"
     try:
         with open(aside, "wb") as file:
-            np.savez(file, **arrays)
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
         os.replace(aside, path)
     finally:
         with contextlib.suppress(FileNotFoundError):
