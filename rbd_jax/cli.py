@@ -532,7 +532,7 @@ def _write(args, model, traj, title: str, notes: dict, ghost=None) -> list[str]:
     if args.out:
         save(args.out, model, traj, **notes)
     if args.html or args.png:
-        film = clip(model, traj, title=title, worlds=SHOWN, forces=args.forces, ghost=ghost)
+        film = clip(model, traj, title=title, worlds=SHOWN, forces=args.forces and bool(args.html), ghost=ghost)
         if args.html:
             write_html(film, args.html)
         if args.png:
@@ -579,7 +579,7 @@ def _film_of_scene(args):
     dt = float(str(np.asarray(model.dt)))
     steps = max(1, round((args.seconds or SECONDS) / dt))
     start = _worlds(model, start, args.worlds, args.perturb, args.seed)
-    _, traj = rollout(model, start, steps, every=max(1, round(1.0 / (SAMPLE_RATE * dt))))
+    _, traj = rollout(model, start, steps, every=_every(steps, dt))
     return clip(model, traj, title=title, worlds=args.worlds)
 
 

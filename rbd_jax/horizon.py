@@ -7,8 +7,9 @@ import functools
 import jax
 import jax.numpy as jnp
 
+from .checks import whole
 from .model import Model, Params, batch_of
-from .rollout import _check_state, _check_wrench, _rollout_batch, _whole, asked, blocks_of
+from .rollout import _check_state, _check_wrench, _rollout_batch, asked, blocks_of
 from .spatial import Vec3, components, qexp
 from .state import State, World
 from .step import with_memory
@@ -63,7 +64,7 @@ def gradient_norms(
       ValueError: as ``rollout``, or an objective that is no function or returns another shape.
     """
     for name, value, least in (("steps", steps, 0), ("every", every, 1)):
-        if not _whole(value, least):
+        if not whole(value, least):
             raise ValueError(f"gradient_norms: {name} = {value!r} must be an integer >= {least}")
     blocks = blocks_of("gradient_norms", checkpoint)
     if not callable(objective):

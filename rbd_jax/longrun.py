@@ -21,6 +21,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from .checks import whole
 from .model import Model, batch_of
 from .record import seconds, versions, whole_or_not_at_all
 from .rollout import rollout
@@ -116,8 +117,7 @@ def long_rollout(
       SaveFailed: a file cannot be written (a full disk); the last whole checkpoint stays, and the error has the state.
     """
     for name, value, least in (("steps", steps, 0), ("every", every, 1), ("chunk", chunk, 1)):
-        good = isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= least
-        if not good and not (name == "chunk" and value is None):
+        if not whole(value, least) and not (name == "chunk" and value is None):
             raise ValueError(f"long_rollout: {name} = {value!r} must be an integer >= {least}")
     if chunk is not None and chunk % every:
         raise ValueError(f"long_rollout: chunk = {chunk} must be a multiple of every = {every}")
@@ -153,7 +153,7 @@ def long_rollout(
                 raise SaveFailed(f"{os.fspath(checkpoint)}: {error}; step {done} is not saved", state, done) from error
 
     with _interruptible() as interrupted:
-        while done < steps and not interrupted:
+        while done < steps and not interrupted.is_set():
             count = min(chunk, steps - done)
             after, traj = rollout(model, state, count, every=every if samples else count, control=control)
             jax.block_until_ready(after)
@@ -182,7 +182,7 @@ def long_rollout(
         if samples and done == steps and steps % every == 0:
             samples.last(steps // every, state)
         save()
-        return LongRun(state, done, bool(interrupted), tuple(found))
+        return LongRun(state, done, interrupted.is_set(), tuple(found))
 
 
 # --- checkpoints ---
@@ -316,27 +316,19 @@ def _diverged(state: State, lost: np.ndarray, before: np.ndarray) -> list[Diverg
     return found
 
 
-class _Flag:
-    def __init__(self):
-        self.raised = False
-
-    def __bool__(self):
-        return self.raised
-
-
 @contextlib.contextmanager
 def _interruptible():
     """A flag that the first Ctrl-C raises; the second is a KeyboardInterrupt. In the main thread only."""
-    flag = _Flag()
+    flag = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield flag
         return
     before = signal.getsignal(signal.SIGINT)
 
     def note(number, frame):
-        if flag.raised:
+        if flag.is_set():
             raise KeyboardInterrupt
-        flag.raised = True
+        flag.set()
 
     signal.signal(signal.SIGINT, note)
     try:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import jax
 import numpy as np
 
+from .checks import whole
 from .tiles import LANES
 
 
@@ -20,7 +21,7 @@ def my_worlds(count: int) -> slice:
     Raises:
       ValueError: count is not an integer >= 1, or there are too few worlds for every process to have some.
     """
-    if not isinstance(count, (int, np.integer)) or isinstance(count, bool) or count < 1:
+    if not whole(count, 1):
         raise ValueError(f"my_worlds: count = {count!r} must be an integer >= 1")
     parts, mine = jax.process_count(), jax.process_index()
     share = -(-count // parts)

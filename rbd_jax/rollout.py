@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .checks import whole
 from .memory import refuse
 from .model import Model, batch_of
 from .spatial import Vec3
@@ -112,7 +113,7 @@ def rollout(
       MemoryError: the samples cannot fit into what the device has left.
     """
     for name, value, least in (("steps", steps, 0), ("every", every, 1), ("truncate", truncate, 1)):
-        if not (name == "truncate" and value is None) and not _whole(value, least):
+        if not (name == "truncate" and value is None) and not whole(value, least):
             raise ValueError(f"rollout: {name} = {value!r} must be an integer >= {least}")
     blocks = blocks_of("rollout", checkpoint)
     truncate = None if truncate is None else int(truncate)
@@ -135,10 +136,6 @@ def rollout(
 # --- checks, before anything is traced ---
 
 
-def _whole(value, least: int) -> bool:
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= least
-
-
 def blocks_of(name: str, checkpoint) -> tuple[int, ...]:
     """Sizes of the blocks of ``checkpoint``, outer first; () for None.
 
@@ -146,7 +143,7 @@ def blocks_of(name: str, checkpoint) -> tuple[int, ...]:
       ValueError: neither None nor an integer >= 1 nor decreasing ones, in the name of function ``name``.
     """
     sizes = () if checkpoint is None else checkpoint if isinstance(checkpoint, tuple) else (checkpoint,)
-    falls = all(_whole(size, 1) for size in sizes) and all(a > b for a, b in zip(sizes, sizes[1:]))
+    falls = all(whole(size, 1) for size in sizes) and all(a > b for a, b in zip(sizes, sizes[1:]))
     if not falls or checkpoint == ():
         raise ValueError(
             f"{name}: checkpoint = {checkpoint!r} must be None, an integer >= 1 or a tuple of decreasing ones, "

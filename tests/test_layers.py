@@ -7,6 +7,7 @@ import rbd_jax
 
 ROOT = pathlib.Path(rbd_jax.__file__).parent
 LAYER = {
+    "checks": 0,
     "struct": 0,
     "status": 0,
     "spatial": 1,

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..build import build
+from ..checks import whole
 from ..method import Method
 from ..model import Model
 from ..rollout import rollout
@@ -95,7 +96,7 @@ class Environment(abc.ABC):
         for field, value in (("substeps", substeps), ("episode", episode)):
             if value is None:
                 continue
-            if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < 1:
+            if not whole(value, 1):
                 raise ValueError(f"task '{self.name}': {field} = {value!r} must be an integer >= 1")
             setattr(self, field, int(value))
         self.model, start = build(self.scene(), dt=self.period / self.substeps, method=method)

@@ -53,7 +53,8 @@ class Clip:
     ``dynamic``: how many of the n are dynamic (default: all). ``names``: of the n bodies.
     ``worlds``: names of worlds (default 'world 0', ...). ``energy`` (W, T) in joules, optional.
     ``contacts``, optional: (points (W, T, c, 3) [m], forces (W, T, c, 3) [N]), a force of NaN where there is none.
-    ``ghost``, optional: (pos, quat) of the same bodies in another run, shown as outlines. Both on the page only.
+    ``ghost``, optional: (pos, quat) of the same bodies in another run, ``ghost_name``, shown as outlines. Both are
+    on the page only.
     """
 
     geoms: Sequence[dict[str, Any]]
@@ -67,6 +68,7 @@ class Clip:
     worlds: Sequence[str] | None = None
     contacts: Any = None
     ghost: Any = None
+    ghost_name: str = "MuJoCo"
 
     def __post_init__(self):
         self.time = _finite("time", self.time)
@@ -201,6 +203,11 @@ class Clip:
             lo[2] = ground
         return lo, hi
 
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """``frame`` of all worlds and of at most 60 instants."""
+        W, T, _ = self.shape
+        return self.frame(range(W), np.unique(np.linspace(0, T - 1, min(T, 60)).round().astype(int)))
+
     def _ground(self, world: int) -> float:
         """Height of the highest level plane that is fixed to the world; -inf if there is none."""
         flat = (np.array(self.kind) == "plane") & (self.body < 0)
@@ -247,6 +254,13 @@ def grid_offsets(count: int, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
     i = np.arange(count)
     x, y = i % cols - (cols - 1) / 2, (rows - 1) / 2 - i // cols
     return np.stack([x * step[0], y * step[1], 0.0 * x], -1)
+
+
+def continuous(quat: np.ndarray) -> np.ndarray:
+    """Signs of quaternions (W, T, n, 4) chosen so that none jumps from sample to sample."""
+    flip = np.sum(quat[:, 1:] * quat[:, :-1], -1, keepdims=True) < 0
+    sign = np.where(np.cumsum(flip, 1) % 2 == 1, -1.0, 1.0)
+    return np.concatenate([quat[:, :1], quat[:, 1:] * sign], 1)
 
 
 def linear(colour: str) -> np.ndarray:

@@ -12,7 +12,7 @@ import struct
 
 import numpy as np
 
-from .clip import Clip, grid_offsets, linear
+from .clip import Clip, continuous, grid_offsets, linear
 
 FLOAT, UINT = 5126, 5125
 VERTICES, INDICES = 34962, 34963
@@ -89,8 +89,7 @@ def glb(clip: Clip) -> bytes:
     """The bytes of the file."""
     buffer = _Buffer()
     W, T, n = clip.shape
-    frames = np.unique(np.linspace(0, T - 1, min(T, 60)).round().astype(int))
-    lo, hi = clip.frame(range(W), frames)
+    lo, hi = clip.bounds()
     offsets = grid_offsets(W, lo, hi)
     width = GROUND * float(np.max(hi - lo))
 
@@ -119,6 +118,7 @@ def glb(clip: Clip) -> bytes:
             mesh_of[kind, colour] = len(meshes) - 1
         return mesh_of[kind, colour]
 
+    quats = continuous(clip.quat)  # the short way round between samples
     nodes = [{"name": clip.title, "rotation": list(ROOT), "children": []}]
     times = buffer.add(clip.time - clip.time[0], "SCALAR", FLOAT, limits=True)
     channels, samplers = [], []
@@ -133,9 +133,7 @@ def glb(clip: Clip) -> bytes:
         world = node(0, name=clip.worlds[w], translation=offsets[w].tolist())
         bodies = []
         for k in range(n):
-            quat = clip.quat[w, :, k]
-            flips = np.cumprod(np.where((quat[1:] * quat[:-1]).sum(-1) < 0, -1.0, 1.0))
-            quat = np.concatenate([quat[:1], quat[1:] * flips[:, None]])  # the short way round between samples
+            quat = quats[w, :, k]
             body = node(
                 world, name=clip.names[k], translation=clip.pos[w, 0, k].tolist(), rotation=xyzw(quat[0]).tolist()
             )

@@ -51,8 +51,7 @@ def pack(clip: Clip) -> tuple[dict, bytes]:
     running sum (modulo 2^16) along time of the int16 arrays ``pos`` and ``quat``, both (W, n, c, T).
     """
     W, T, n = clip.shape
-    worlds, frames = range(W), np.unique(np.linspace(0, T - 1, min(T, 60)).round().astype(int))
-    lo, hi = clip.frame(worlds, frames)
+    lo, hi = clip.bounds()
     arrays = {
         "time": clip.time.astype(np.float64),
         "geom_size": _shared(clip.geom_size).astype(np.float32),
@@ -74,7 +73,7 @@ def pack(clip: Clip) -> tuple[dict, bytes]:
     raw = b"".join(a.tobytes().ljust(-(-a.nbytes // 8) * 8, b"\0") for a in arrays.values())
     head = {
         "title": clip.title,
-        "ghost": "MuJoCo",
+        "ghost": clip.ghost_name,
         "shape": [W, T, n],
         "dynamic": clip.dynamic,
         "names": clip.names,
@@ -100,7 +99,7 @@ def _poses(prefix: str, pos: np.ndarray, quat: np.ndarray) -> dict[str, np.ndarr
     pos = pos.transpose(0, 2, 3, 1)
     mid = (pos.max(-1) + pos.min(-1)) / 2
     step = np.maximum((pos.max(-1) - pos.min(-1)) / 2 / FULL, 1e-12)
-    quat = _continuous(quat).transpose(0, 2, 3, 1)
+    quat = look.continuous(quat).transpose(0, 2, 3, 1)
     # float32 first in use: quantise against the numbers that the page will read
     mid, step = mid.astype(np.float32), step.astype(np.float32)
     return {
@@ -139,13 +138,6 @@ def _contacts(points: np.ndarray, forces: np.ndarray) -> dict[str, np.ndarray]:
 def _shared(a: np.ndarray) -> np.ndarray:
     """One row where all worlds agree."""
     return a[:1] if np.all(a == a[:1]) else a
-
-
-def _continuous(quat: np.ndarray) -> np.ndarray:
-    """Signs of quaternions (W, T, n, 4) chosen so that none jumps from sample to sample."""
-    flip = np.sum(quat[:, 1:] * quat[:, :-1], -1, keepdims=True) < 0
-    sign = np.where(np.cumsum(flip, 1) % 2 == 1, -1.0, 1.0)
-    return np.concatenate([quat[:, :1], quat[:, 1:] * sign], 1)
 
 
 def _differences(values: np.ndarray) -> np.ndarray:

@@ -499,11 +499,7 @@ const EDGES = [0, 1, 2].flatMap((axis) => [0, 1, 2, 3].map((k) => [-1, 1].map((e
 })));
 
 /** Trails, forces of contact and the other run, over the picture: nothing hides them. */
-function drawMarks(x, o, list, c, view) {
-  const seen = (p) => {  // [x, y, distance from the eye] of a point; null behind it
-    const k = [0, 1, 3].map((r) => view[r] * p[0] + view[4 + r] * p[1] + view[8 + r] * p[2] + view[12 + r]);
-    return k[2] > 0 ? [(k[0] / k[2] + 1) / 2 * o.clientWidth, (1 - k[1] / k[2]) / 2 * o.clientHeight, k[2]] : null;
-  };
+function drawMarks(x, o, list, c, seen) {
   const line = (points) => {
     let pen = false;
     x.beginPath();
@@ -573,18 +569,21 @@ function drawOverlay(ratio, list, places, c, view) {
   x.font = "12px system-ui, sans-serif";
   x.textAlign = "center";
   x.textBaseline = "middle";
-  drawMarks(x, o, list, c, view);
+  const seen = (p) => {  // [x, y, distance from the eye] of a point; null behind it
+    const k = [0, 1, 3].map((r) => view[r] * p[0] + view[4 + r] * p[1] + view[8 + r] * p[2] + view[12 + r]);
+    return k[2] > 0 ? [(k[0] / k[2] + 1) / 2 * o.clientWidth, (1 - k[1] / k[2]) / 2 * o.clientHeight, k[2]] : null;
+  };
+  drawMarks(x, o, list, c, seen);
   if (state.layout === "grid") list.forEach(({ w, at }, index) => {
     // below what the world shows now
     const lo = add(add(one.lo, at), add(one.hi, one.lo, -1), -0.2), hi = add(add(one.hi, at), add(one.hi, one.lo, -1), 0.2);
     let left = Infinity, right = -Infinity, sy = -Infinity;
     for (const p of places[index].filter((q) => q.every((v, k) => v >= lo[k] && v <= hi[k]))) {
-      const k = [0, 1, 3].map((r) => view[r] * p[0] + view[4 + r] * p[1] + view[8 + r] * p[2] + view[12 + r]);
-      if (k[2] <= 0) continue;
-      const x = (k[0] / k[2] + 1) / 2 * o.clientWidth;
-      left = Math.min(left, x);
-      right = Math.max(right, x);
-      sy = Math.max(sy, (1 - k[1] / k[2]) / 2 * o.clientHeight);
+      const m = seen(p);
+      if (!m) continue;
+      left = Math.min(left, m[0]);
+      right = Math.max(right, m[0]);
+      sy = Math.max(sy, m[1]);
     }
     if (left > right) return;
     const sx = (left + right) / 2;

@@ -24,8 +24,7 @@ def write_usda(clip: Clip, path: str | os.PathLike[str]) -> None:
 def usda(clip: Clip) -> str:
     """The text of the file."""
     W, T, n = clip.shape
-    frames = np.unique(np.linspace(0, T - 1, min(T, 60)).round().astype(int))
-    lo, hi = clip.frame(range(W), frames)
+    lo, hi = clip.bounds()
     offsets = grid_offsets(W, lo, hi)
     width = GROUND * float(np.max(hi - lo))
     time = clip.time - clip.time[0]

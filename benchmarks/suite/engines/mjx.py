@@ -45,7 +45,7 @@ class MJX(Engine):
         return metadata.version("mujoco-mjx")
 
     def most(self, case: Case) -> int:
-        return min(case.worlds, most(case))
+        return most(case)
 
     def load(self, case: Case, variant: str, dt: float, dtype: str) -> Simulation:
         return _Simulation(case, dt)

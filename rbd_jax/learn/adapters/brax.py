@@ -38,7 +38,6 @@ class BraxEnv:
     def __init__(self, task: Environment):
         self.task = task
         self.observation_size, self.action_size = task.observation_size, task.action_size
-        self._names = None
 
     @property
     def sys(self):
