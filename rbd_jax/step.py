@@ -513,6 +513,7 @@ def _problem(p: Params, old: Bodies, v: Vec3, turning, contacts) -> Problem:
         inv_mass=p.inv_mass,
         h=p.h,
         warm=tuple(c.warm for c in contacts),
+        load=tuple(jnp.abs(c.last.n) for c in contacts),  # negative: an impact
         one=p.one,
         q=old.q,
         inertia=p.inertia,

@@ -86,7 +86,27 @@ def test_the_exit_speed_from_overlap_is_bounded():
         model, state = rbd.build(rbd.Scene(bodies, gravity=None, dt=1 / 60), method=preset)
         _, traj = rbd.rollout(model, state, 60)
         speed = np.diff(np.asarray(traj.vel)[:, :, 2], axis=1)
-        assert 0.1 < speed.max() <= 2.0 + 1e-9
+        assert 0.1 < speed.max() <= 1.01 * model.method.contact.push_speed
+
+
+def test_a_stack_that_starts_in_overlap_is_not_thrown_up():
+    """Five cubes askew in each other by up to 17 mm: what pushes them out gives them 4 % of their energy, not as much
+    again (the top one flew 0.9 m)."""
+    cube = lambda k: rbd.Body(
+        f"c{k}",
+        rbd.Box((0.1, 0.1, 0.1)),
+        pos=(0.01 * k, 0, 0.1 + 0.199 * k),
+        quat=(1, 0.02 * k, 0.01 * k, 0),
+        mass=1.0,
+        friction=0.6,
+    )
+    scene = rbd.Scene([cube(k) for k in range(5)], [rbd.Geom(rbd.Plane(), friction=0.6)], dt=1 / 240)
+    model, state = rbd.build(scene, method="fast")
+    assert model.method.solver.name == "newton_lagged"
+    final, traj = rbd.rollout(model, state, 120)
+    energy = np.asarray(sum(rbd.energy(model, traj)))
+    assert energy.max() < 1.05 * energy[0]
+    assert 0.88 < float(final.pos[4, 2]) < 0.91
 
 
 @pytest.mark.parametrize(

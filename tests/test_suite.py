@@ -20,6 +20,7 @@ from suite import (  # noqa: E402
     run,
     store,
 )
+from suite.case import Motion  # noqa: E402
 
 from rbd_jax.cli import main as cli  # noqa: E402
 
@@ -72,6 +73,17 @@ def test_the_oblique_impact_keeps_what_it_must():
 
 
 # --- rows ---
+
+
+def test_rest_forces_by_the_balance_of_momentum():
+    """At rest all is carried; where the top one of 4, 2 and 1 kg speeds up by g, 8/7, 4/3 and 2 of the weights are."""
+    case = CASES["forces"]
+    at_rest = case.start(2)
+    time = np.linspace(0.0, 1.0, 51)
+    motion = Motion(time, *(np.repeat(getattr(at_rest, k), 51, axis=0) for k in ("pos", "quat", "vel", "omega")))
+    assert case.error(motion, None, case) == pytest.approx([0.0, 0.0])
+    motion.vel[:, 1, 2, 2] = 9.81 * time
+    assert case.error(motion, None, case) == pytest.approx([0.0, np.sqrt((1 / 49 + 1 / 9 + 1) / 3)])
 
 
 def test_a_corrupt_row_is_named_and_skipped(tmp_path):

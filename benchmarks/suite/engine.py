@@ -67,6 +67,10 @@ class Engine(abc.ABC):
         """Worlds at most that its programs are made for; errors are taken of no more."""
         return case.worlds
 
+    def order(self, case: Case, variant: str) -> int | None:
+        """Order in the step that its error should show above its floor; None: none is claimed."""
+        return None
+
     @abc.abstractmethod
     def load(self, case: Case, variant: str, dt: float, dtype: str) -> Simulation:
         """The case, ready to run.

@@ -55,6 +55,20 @@ def energy_change(motion, other, case) -> np.ndarray:
     return np.abs(e / e[0] - 1).max(0)
 
 
+def rest_forces(motion, other, case) -> np.ndarray:
+    """(B,) of a column at rest, bodies from the bottom up: the force that carries a body and all above it, over their
+    weight, minus 1; root mean square over the bodies and over the last fifth of the intervals between two samples.
+
+    By the balance of momentum, so that any engine can be asked: the mean of the force over an interval.
+    """
+    mass, g = np.array([p.mass for p in case.parts]), -case.gravity[2]
+    late = slice(-max(len(motion.time) // 5, 1) - 1, None)
+    gained = np.diff(motion.vel[late, ..., 2], axis=0) / np.diff(motion.time[late])[:, None, None]
+    from_top = lambda x: np.cumsum(x[..., ::-1], axis=-1)[..., ::-1]
+    carried = from_top(mass * (gained + g)) / from_top(mass * g)
+    return np.sqrt(((carried - 1) ** 2).mean(axis=(0, 2)))
+
+
 def overlap(motion, other, case) -> np.ndarray:
     """(B,) deepest overlap at the last sample over the smallest half-size [-]; infinite where a body has left."""
     from common import MuJoCo  # MuJoCo's geometry is the ruler of every engine

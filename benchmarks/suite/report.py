@@ -187,6 +187,35 @@ def _slopes(rows: list, cases, engines, others: bool) -> list[str]:
     return _table(header, lines)
 
 
+#: A fitted order may be off by this.
+NEAR = 0.2
+
+
+def _orders(rows: list, cases, engines) -> list[str]:
+    """Orders of ours against those they should have, to the truth or to their own limit."""
+    lines, met, judged = [], 0, 0
+    for name, case in cases.items():
+        for c in analysis.curves(rows, name):
+            wanted = engines[c.engine].order(case, c.variant) if c.engine == OURS and OURS in engines else None
+            if wanted is None:
+                continue
+            fit = c.order if c.order and c.order.slope is not None else c.self_order
+            if fit is None or fit.slope is None:
+                floor = fit or c.order
+                seen, verdict = "-", f"at its floor, {floor.floor:.1e}" if floor and floor.floor else "too few points"
+            else:
+                near = abs(fit.slope - wanted) <= NEAR
+                judged, met = judged + 1, met + near
+                seen, verdict = f"{fit.slope:.2f} ({fit.used})", "yes" if near else "**no**"
+            lines.append([case_title(cases, name), c.variant, c.dtype, wanted, seen, verdict])
+    if not lines:
+        return ["No curve of ours with an order to show.", ""]
+    told = f'{met} of {judged} fitted orders are within {NEAR} of what they should be; the other curves have less than \
+three points above their floor. None is claimed at rest, in piles, where impacts are hit at their instant, and of \
+"fast" in contact, which splits coarse steps.'
+    return [told, "", *_table(["case", "variant", "dtype", "should be", "order (points)", "within 0.2"], lines)]
+
+
 def _failures(rows: list, cases, engines) -> list[str]:
     """Points that did not run, per case, engine and variant, with the reasons."""
     text, lost = [], collections.defaultdict(list)
@@ -335,6 +364,7 @@ def _sections(rows: list, every: list, cases, engines, machine, runs) -> list[tu
         ("Failed and skipped points", _failures(rows, cases, engines)),
         ("Changes since the commit before", _history(every, cases, engines, machine)),
         ("How to read the charts", [READING, ""]),
+        ("Orders of rbd_jax against what they should be", _orders(rows, cases, engines)),
         ("Orders and floors", _slopes(rows, cases, engines, False)),
         (PAGE_ONLY, _slopes(rows, cases, engines, True)),
         ("Cases", _cases(cases, seen)),

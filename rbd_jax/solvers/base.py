@@ -27,6 +27,8 @@ class Problem:
       h: step [s], scalar or (B,). nominal: the step over which overlap is resolved, where h is what impacts left
         of it; None = h.
       warm: impulses to start from, one entry a group, already zero where a contact is new.
+      load: normal impulses of the step before, one entry a group (S, P, B), zero where a point is new; those of
+        impacts among them. None = unknown.
       smoothing: (normal, slip) speeds [m/s] over which a solver that smooths does so, each (1,) or (B,).
       contact: the ``laws.ContactModel``, None = the solver's own.
       one: an array equal to 1 that XLA cannot see through, see ``rbd_jax.xla.materialise``.
@@ -39,6 +41,7 @@ class Problem:
     h: jax.Array
     warm: tuple[Impulses, ...]
     one: jax.Array
+    load: tuple[jax.Array, ...] | None = None
     nominal: jax.Array | None = None
     w0: Vec3 | None = None
     w: Vec3 | None = None
@@ -47,6 +50,15 @@ class Problem:
     inv_inertia: InverseInertia | None = None
     smoothing: tuple | None = None
     contact: object = static(default=None)
+
+    @property
+    def loads(self) -> tuple:
+        """``load``, with a None for every group where it is unknown."""
+        return (None,) * len(self.rows) if self.load is None else self.load
+
+    def without_rows(self) -> Problem:
+        """What all groups share."""
+        return self._with(rows=(), warm=(), load=None)
 
 
 @struct
@@ -106,16 +118,16 @@ class Solver:
     def solve(self, problem: Problem) -> Solution:
         raise NotImplementedError
 
-    def final_law(self, rows: Rows, p: Impulses, w: jax.Array, problem: Problem, solution: Solution):
+    def final_law(self, rows: Rows, p: Impulses, w: jax.Array, problem: Problem, solution: Solution, load: jax.Array):
         """The ``laws.Law`` that impulses and end-of-step velocities of a group obey where this solver has converged.
 
         An impact with restitution hits its target velocity rigidly. ``p``: the impulses of the group; ``w`` as in
-        ``ContactModel.law``. Only ``residuals`` asks.
+        ``ContactModel.law``, and so is ``load``. Only ``residuals`` asks.
         """
         from .laws import contact_model
         from .restitution import targets
 
-        law = contact_model(self, problem).law(rows, w, problem)
+        law = contact_model(self, problem).law(rows, w, problem, load)
         if rows.e is None:
             return law
         events = targets(rows, problem)

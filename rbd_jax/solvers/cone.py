@@ -60,7 +60,7 @@ class ConeNewton(Solver):
             name = type(self).__name__
             raise ValueError(f"{name}({self.iterations}, {self.search}): needs 2 iterations and 1 search step")
 
-    def law(self, c: Contacts, rows: Rows, problem: Problem) -> ConeLaw:
+    def law(self, c: Contacts, rows: Rows, problem: Problem, load) -> ConeLaw:
         """Stiffness, friction and reference of one group."""
         raise NotImplementedError
 
@@ -70,9 +70,9 @@ class ConeNewton(Solver):
 
     def solve(self, problem: Problem) -> Solution:
         cs = tuple(dense.contacts(rows, problem) for rows in problem.rows)
-        laws = tuple(self.law(c, rows, problem) for c, rows in zip(cs, problem.rows))
+        laws = tuple(self.law(c, rows, problem, load) for c, rows, load in zip(cs, problem.rows, problem.loads))
         free = tuple(self.free(c, rows, law, problem) for c, rows, law in zip(cs, problem.rows, laws))
-        system = _System(cs, laws, free, problem._with(rows=(), warm=()))
+        system = _System(cs, laws, free, problem.without_rows())
         start = tuple(_masked(c, warm) for c, warm in zip(cs, problem.warm))
 
         solution = implicit.root(

@@ -31,7 +31,7 @@ class MujocoNewton(ConeNewton):
     models = ("mujoco",)
     level = "force"
 
-    def law(self, c: Contacts, rows: Rows, problem: Problem) -> ConeLaw:
+    def law(self, c: Contacts, rows: Rows, problem: Problem, load) -> ConeLaw:
         return _law(c, rows, problem)
 
     def free(self, c: Contacts, rows: Rows, law: ConeLaw, problem: Problem) -> Impulses:

@@ -131,28 +131,30 @@ class NewtonLagged(Solver):
         return loops_are_cheap() and plain and not self.polish
 
     def _in_loops(self, problem: Problem) -> Solution:
-        bare = problem._with(rows=(), warm=())
+        bare = problem.without_rows()
         run = piece(functools.partial(newton_loop.group, self._of_group))
         # what the rows of a group do not need must not be among the arguments of its function
         least = bare._with(q=None, inertia=None)
         found = []
-        for rows, warm in zip(problem.rows, problem.warm):
+        for rows, warm, load in zip(problem.rows, problem.warm, problem.loads):
             asks_back = rows.e is not None or rows.law is not None
-            found.append(run(rows._with(feature=None), warm, least if asks_back else least._with(v0=None, w0=None)))
+            shared = least if asks_back else least._with(v0=None, w0=None)
+            found.append(run(rows._with(feature=None), warm, load, shared))
         p, impulse, turn, wrong = newton_loop.solve(self, *zip(*found), bare)
         return Solution(impulse=impulse, angular_impulse=turn, contacts=p, unconverged=wrong)
 
-    def _of_group(self, rows: Rows, warm: Impulses, problem: Problem):
+    def _of_group(self, rows: Rows, warm: Impulses, load, problem: Problem):
         c = dense.contacts(rows, problem)
         free = dense.relative(c, rows, problem.v, problem.w)
-        law = self._law(c, rows, problem, self.event_beta)
+        law = self._law(c, rows, problem, self.event_beta, load)
         return c, law, free, _start(c, warm), _bound(law, warm.n, free)
 
     def _system(self, problem: Problem):
         """What the rows depend on, and the impulses and bounds of friction to start from."""
         cs = tuple(dense.contacts(rows, problem) for rows in problem.rows)
         free = tuple(dense.relative(c, rows, problem.v, problem.w) for c, rows in zip(cs, problem.rows))
-        laws = tuple(self._law(c, rows, problem, self.event_beta) for c, rows in zip(cs, problem.rows))
+        groups = zip(cs, problem.rows, problem.loads)
+        laws = tuple(self._law(c, rows, problem, self.event_beta, load) for c, rows, load in groups)
         p = tuple(_start(c, g) for c, g in zip(cs, problem.warm))
         bound = tuple(_bound(law, warm.n, x) for law, warm, x in zip(laws, p, free))
         smooth = None
@@ -160,7 +162,7 @@ class NewtonLagged(Solver):
             if problem.smoothing is None:
                 raise ValueError("NewtonLagged.smoothing needs the numbers Problem.smoothing")
             smooth = problem.smoothing
-        return _System(cs, laws, free, problem._with(rows=(), warm=()), smooth), (p, bound)
+        return _System(cs, laws, free, problem.without_rows(), smooth), (p, bound)
 
     def _found(self, system: _System, start):
         """Impulses, and the bound of their friction."""
@@ -231,19 +233,18 @@ class NewtonLagged(Solver):
         d = materialise_linear(d, problem.v.x + 0.0 * p[0].n.sum((0, 1)), problem.one)
         return tuple(_minus(r, g @ dense.at_points(c, *d)) for c, g, r in zip(cs, gs, rs))
 
-    def _law(self, c: Contacts, rows: Rows, problem: Problem, event_beta: float) -> _Law:
+    def _law(self, c: Contacts, rows: Rows, problem: Problem, event_beta: float, load) -> _Law:
         w = dense.inverse_mass(c, problem)
-        model = convex(contact_model(self, problem).law(rows, w, problem), rows, w, problem, event_beta)
+        model = convex(contact_model(self, problem).law(rows, w, problem, load), rows, w, problem, event_beta)
         count = points(rows, w.dtype)
         law = _Law(
             w=w, r=model.r, vhat=model.vhat, points=count, mu=rows.mu, mu_spin=rows.mu_spin, mu_roll=rows.mu_roll
         )
         return materialise(law, problem.one)
 
-    def final_law(self, rows: Rows, p: Impulses, w, problem: Problem, solution: Solution) -> Law:
-        law = self._law(
-            dense.contacts(rows, problem), rows, problem, 0.0 if _single_sphere(problem) else self.event_beta
-        )
+    def final_law(self, rows: Rows, p: Impulses, w, problem: Problem, solution: Solution, load) -> Law:
+        rest = (0.0, None) if _single_sphere(problem) else (self.event_beta, load)
+        law = self._law(dense.contacts(rows, problem), rows, problem, *rest)
         return Law(law.vhat, law.r)
 
     def _linearised(self, system: _System, bound, p, u=None) -> tuple[tuple[Impulses, Sym3 | Sym6], ...]:
@@ -331,7 +332,7 @@ class NewtonLagged(Solver):
         one = problem.one
         c = dense.contacts(rows, problem)
         u = dense.relative(c, rows, problem.v, problem.w)
-        law = self._law(c, rows, problem, 0.0)
+        law = self._law(c, rows, problem, 0.0, None)
         pn = jnp.where(c.live, jnp.maximum((law.vhat - u.n) / (law.r + law.w), 0.0), 0.0)
         p = Impulses(pn)
         if c.friction:

@@ -42,9 +42,9 @@ class NewtonCone(ConeNewton):
     name = "newton_cone"
     contact = "near_rigid"
 
-    def law(self, c: Contacts, rows: Rows, problem: Problem) -> ConeLaw:
+    def law(self, c: Contacts, rows: Rows, problem: Problem, load) -> ConeLaw:
         w = dense.inverse_mass(c, problem)
-        model = convex(contact_model(self, problem).law(rows, w, problem), rows, w, problem, self.event_beta)
+        model = convex(contact_model(self, problem).law(rows, w, problem, load), rows, w, problem, self.event_beta)
         vhat, r = model.vhat, model.r
         live = jnp.where(c.live, 1.0, 0.0).astype(w.dtype)
         if not c.friction:
@@ -61,8 +61,8 @@ class NewtonCone(ConeNewton):
         law = ConeLaw(live / r, slip._with(n=vhat), live / rt, mu, mu * jnp.sqrt(rt / r), **angular)
         return materialise(law, problem.one)
 
-    def final_law(self, rows: Rows, p: Impulses, w, problem: Problem, solution: Solution) -> Law:
-        law = self.law(dense.contacts(rows, problem), rows, problem)
+    def final_law(self, rows: Rows, p: Impulses, w, problem: Problem, solution: Solution, load) -> Law:
+        law = self.law(dense.contacts(rows, problem), rows, problem, load)
         return Law(law.reference.n, 1.0 / jnp.where(law.dn > 0, law.dn, 1.0))
 
     def free(self, c: Contacts, rows: Rows, law: ConeLaw, problem: Problem) -> Impulses:

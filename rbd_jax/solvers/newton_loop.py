@@ -52,25 +52,25 @@ class Group:
     pairs: Listed
 
 
-def group(make, rows: Rows, warm: Impulses, problem: Problem):
+def group(make, rows: Rows, warm: Impulses, load, problem: Problem):
     """A group, and its impulses and bounds of friction to start from.
 
-    make(rows, warm, problem) -> (contacts, law, free velocities, impulses, bounds).
+    make(rows, warm, load, problem) -> (contacts, law, free velocities, impulses, bounds).
     """
     live = rows.live.any(axis=-1).T
     index = lambda i: None if i is None else jnp.asarray(i.rows)
     rows_b, rows_a = index(rows.b), index(rows.a)
     of_bodies, leaves = _split(problem)
 
-    def local(pair, rows, warm):
+    def local(pair, rows, warm, load):
         if pair is None:
-            return _bare(*make(rows, warm, problem))
+            return _bare(*make(rows, warm, load, problem))
         ends = [i[pair] for i in (rows_b, rows_a) if i is not None]
         both = jax.tree.map(lambda *c: jnp.concatenate(c), *[read(of_bodies, row) for row in ends])
         rows = rows._with(b=Index([0]), a=None if rows_a is None else Index([1]))
-        return _bare(*make(rows, warm, leaves(materialise(both, problem.one))))
+        return _bare(*make(rows, warm, load, leaves(materialise(both, problem.one))))
 
-    c, law, free, p, bound = each_pair(local, live.any(axis=1), rows, warm)
+    c, law, free, p, bound = each_pair(local, live.any(axis=1), rows, warm, load)
     apart = None
     if c.ra is not None:
         apart = Vec3(*(a[0] - b[0] for a, b in zip(components(rows.ra), components(rows.rb))))

@@ -34,7 +34,7 @@ class PGS(Solver):
 
     def solve(self, problem: Problem) -> Solution:
         model, one = contact_model(self, problem), problem.one
-        groups = [piece(prepare)(rows, problem._with(rows=(), warm=())) for rows in problem.rows]
+        groups = [piece(prepare)(rows, problem.without_rows()) for rows in problem.rows]
         body = (problem.v, problem.w)
         warm = [arranged(l, g.plan) for g, l in zip(groups, problem.warm)]
         for g, l in zip(groups, warm):

@@ -58,7 +58,10 @@ def nothing(worlds: int, dtype) -> Residuals:
 def residuals(solver: Solver, problem: Problem, solution: Solution) -> Residuals:
     """Residuals and work of a solution; rounding of u is that of the body velocities."""
     cs = tuple(dense.contacts(rows, problem) for rows in problem.rows)
-    parts = [_group(solver, c, *rest, problem, solution) for c, *rest in zip(cs, problem.rows, solution.contacts)]
+    parts = [
+        _group(solver, c, rows, p, problem, solution, load)
+        for c, rows, p, load in zip(cs, problem.rows, solution.contacts, problem.loads)
+    ]
     impulse, _ = dense.on_bodies(cs, solution.contacts, problem)
     miss = impulse - solution.impulse
     momentum = _length((miss.x, miss.y, miss.z)).max(axis=0)
@@ -72,13 +75,13 @@ def residuals(solver: Solver, problem: Problem, solution: Solution) -> Residuals
 WORST = ("signorini", "complementarity", "cone", "dissipation")
 
 
-def _group(solver: Solver, c: Contacts, rows: Rows, p: Impulses, problem: Problem, solution: Solution) -> dict:
+def _group(solver: Solver, c: Contacts, rows: Rows, p: Impulses, problem: Problem, solution: Solution, load) -> dict:
     v, w = solution.velocities(problem)
     shape = jnp.broadcast_shapes(rows.live.shape, (1, 1, problem.v.x.shape[-1]))
     live = jnp.broadcast_to(rows.live, shape)
     u = dense.relative(c, rows, v, w)
     k = dense.inverse_mass(c, problem)
-    law = solver.final_law(rows, p, k, problem, solution)
+    law = solver.final_law(rows, p, k, problem, solution, load)
     gap = u.n - law.vhat if law.r is None else u.n - law.vhat + law.r * p.n
     worst = lambda x: jnp.where(live, x, 0.0).max(axis=(0, 1))
     total = lambda x: jnp.where(live, x, 0.0).sum(axis=(0, 1))

@@ -49,7 +49,7 @@ class TGS(Solver):
         if single.applies(problem):
             return single.solve(problem, model)
         one = problem.one
-        groups = [piece(prepare)(rows, problem._with(rows=(), warm=())) for rows in problem.rows]
+        groups = [piece(prepare)(rows, problem.without_rows()) for rows in problem.rows]
         lam = [arranged(l, g.plan) for g, l in zip(groups, problem.warm)]
         body = (problem.v, problem.w)
         for g, l in zip(groups, lam):
@@ -64,14 +64,14 @@ class TGS(Solver):
         body, lam = sweeps(groups, hard, lam, body, one, self.relax)
         return solution(problem, groups, body, lam, moving)
 
-    def final_law(self, rows: Rows, p: Impulses, w, problem: Problem, solution: Solution) -> Law:
+    def final_law(self, rows: Rows, p: Impulses, w, problem: Problem, solution: Solution, load) -> Law:
         """That of the relaxing sweeps: no bias on overlap, gaps as they are after the move.
 
         A gap that carries nothing at the end binds the velocity of the move, not that of the end.
         """
         model = contact_model(self, problem)
         if model.physical:
-            return super().final_law(rows, p, w, problem, solution)
+            return super().final_law(rows, p, w, problem, solution, load)
         v, w_end = solution.velocities(problem)
         end = normal_velocity(rows, v, w_end)
         moved = normal_velocity(rows, solution.v_move, w_end if solution.w_move is None else solution.w_move)

@@ -1,11 +1,13 @@
-"""Sustained contact: stacks that must stand where rigid bodies do, a box that tips on its edge."""
+"""Sustained contact: stacks that must stand where rigid bodies do, their forces, a box that tips on its edge."""
 
 from __future__ import annotations
+
+import dataclasses
 
 import numpy as np
 
 from ..case import Case, Motion, box
-from ..judge import attitude, position, rotated, times, yaw
+from ..judge import attitude, position, rest_forces, rotated, times, yaw
 from .free import STEPS, G, sample_times
 from .impact import GROUND
 
@@ -34,6 +36,14 @@ def stack(name, title, masses):
         friction=MU, restitution=None, gravity=G, starts=starts, seconds=2.0, samples=4, truth=None,
         reference="heights of rigid cubes at rest", bound=0.0, error=error, unit="heights after 2 s over half-size",
         distance=position, steps=STEPS, features=frozenset({"contact", "friction", "attitude", "pairs"}),
+    )  # fmt: skip
+
+
+def forces(masses):
+    """The forces in a column that fell 2 mm, in windows of 20 ms at the end of a second."""
+    return dataclasses.replace(
+        stack("forces", "forces in a column at rest", masses), seconds=1.0, samples=50, error=rest_forces,
+        reference="weights", unit="force over weight, root mean square over windows of 20 ms",
     )  # fmt: skip
 
 
@@ -89,6 +99,7 @@ EDGEWISE = Case(
 
 CASES = (
     stack("column", "column of two boxes", (1.0, 1.0)),
+    forces((4.0, 2.0, 1.0)),
     stack("stack5", "five-box stack", (1.0,) * 5),
     stack("stack10", "ten-box stack", (1.0,) * 10),
     stack("heavy", "100 kg on 1 kg", (1.0, 100.0)),

@@ -66,6 +66,18 @@ class Ours(Engine):
     def version(self) -> str:
         return rbd.__version__
 
+    def order(self, case: Case, variant: str) -> int | None:
+        """That of the integrator in free flight, 2 of a slide, 1 where impacts fall between steps.
+
+        None is claimed where the step is not what decides: at rest, in piles, where impacts are hit at their instant,
+        and of "fast" in contact, which splits coarse steps.
+        """
+        if case.group == "free":
+            return rbd.build(case.scene(), method=_method(variant, case))[0].method.integrator.order
+        if variant != "accurate":
+            return None
+        return {"impact": 1, "friction": 2}.get(case.group)
+
     def load(self, case: Case, variant: str, dt: float, dtype: str) -> Simulation:
         return _Simulation(case, _method(variant, case), dt, dtype)
 

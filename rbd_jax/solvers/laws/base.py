@@ -53,8 +53,9 @@ class ContactModel:
     #: of the velocities what it adds to recover from overlap.
     physical: ClassVar[bool] = False
 
-    def law(self, rows: Rows, w: jax.Array, problem) -> Law:
-        """The law of one group; ``w`` [1/kg] (S, P, B) is the inverse mass seen by each normal row."""
+    def law(self, rows: Rows, w: jax.Array, problem, load: jax.Array | None = None) -> Law:
+        """The law of one group; ``w`` [1/kg] (S, P, B) is the inverse mass seen by each normal row, ``load`` [N s] the
+        normal impulse that each carried in the step before (0 where it is new), None = unknown."""
         raise NotImplementedError
 
     def energy(self, rows: Rows, w: jax.Array, problem) -> jax.Array | None:

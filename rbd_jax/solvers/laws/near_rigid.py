@@ -34,19 +34,21 @@ def convex(law: Law, rows: Rows, w, problem, event_beta: float) -> Law:
 @dataclasses.dataclass(frozen=True)
 class NearRigid(ContactModel):
     """beta: near-rigid parameter [-]. push_speed: bound of the speed at which a contact resolves overlap [m/s];
-    bodies part at up to ``EXIT`` times this.
+    bodies part at up to ``EXIT`` times this. The speed stays in the velocities, so it is low.
     """
 
     beta: float = 0.05
-    push_speed: float = 2.0
+    push_speed: float = 0.2
 
     name = "near_rigid"
 
-    def law(self, rows, w, problem) -> Law:
+    def law(self, rows, w, problem, load=None) -> Law:
         r = near_rigid(self.beta) * points(rows, w.dtype) * w
         vhat = recovery(rows.phi, problem, 1.0, math.inf)
-        fast = vhat > self.push_speed
-        # the bound is one of speed, not of load: the force at rest stays vhat / r
+        # the bound is one of speed, not of load: the overlap r load h is that of the load, and none to push out
+        if load is not None:
+            return Law(jnp.minimum(vhat, self.push_speed + r * load), r)
+        fast = vhat > self.push_speed  # the force at rest, vhat / r, stays
         slow = jnp.where(fast, self.push_speed / jnp.where(fast, vhat, 1.0), 1.0)
         return Law(vhat * slow, r * slow)
 
@@ -65,5 +67,5 @@ class Baumgarte(ContactModel):
     name = "baumgarte"
     reach = "all"
 
-    def law(self, rows, w, problem) -> Law:
+    def law(self, rows, w, problem, load=None) -> Law:
         return Law(recovery(rows.phi, problem, self.fraction, self.push_speed))

@@ -30,7 +30,7 @@ class Soft(ContactModel):
     name = "soft"
     reach = "all"
 
-    def law(self, rows, w, problem) -> Law:
+    def law(self, rows, w, problem, load=None) -> Law:
         om = 2.0 * math.pi * self.stiffness
         stiff = om * (2.0 * self.damping_ratio + om)
         vhat = recovery(rows.phi, problem, om / (2.0 * self.damping_ratio + om), self.push_speed)
@@ -50,7 +50,7 @@ class Hertz(ContactModel):
     name = "hertz"
     physical = True
 
-    def law(self, rows, w, problem) -> Law:
+    def law(self, rows, w, problem, load=None) -> Law:
         om = 2.0 * math.pi * self.hertz * problem.h
         both = 2.0 * self.damping_ratio + om
         vhat = recovery(rows.phi, problem, om / both, self.push_speed)

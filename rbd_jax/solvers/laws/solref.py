@@ -24,7 +24,7 @@ class Solref(ContactModel):
     reach = "margin"
     physical = True
 
-    def law(self, rows, w, problem) -> Law:
+    def law(self, rows, w, problem, load=None) -> Law:
         law, h = rows.law, problem.h
         weight = _weight(rows, problem)
         d = impedance(law, rows.phi)

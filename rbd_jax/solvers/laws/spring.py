@@ -31,7 +31,7 @@ class Spring(ContactModel):
             if not (low and math.isfinite(getattr(self, field))):
                 raise ValueError(f"Spring.{field} = {getattr(self, field)}: stiffness > 0 [N/m], relaxation >= 0 [s]")
 
-    def law(self, rows, w, problem) -> Law:
+    def law(self, rows, w, problem, load=None) -> Law:
         slow = problem.h + self.relaxation
         compliance = 1.0 / (problem.h * self.stiffness * slow)
         return Law(-rows.phi / slow, points(rows, w.dtype) * compliance + 0.0 * w)
