@@ -12,6 +12,8 @@ cores, its actions as ``xfrc_applied``, observations and rewards in numpy. A con
 curves: every task learned by PPO and by gradients through the simulator (those in THROUGH), for so many seconds and
 seeds; returns are those of the episodes that end while it learns, final returns those of 256 fresh episodes.
 
+clips: what the first seed of PPO does in four worlds, learning_TASK.gif.
+
 Appends to learning.jsonl and writes learning.md and learning_curves.png under ``--out`` (benchmarks/results).
 """
 
@@ -32,9 +34,10 @@ import common  # noqa: E402
 from common import number  # noqa: E402
 from mujoco import rollout as mj_rollout  # noqa: E402
 
-from rbd_jax.learn import TASKS, AutoReset, make, ppo, through, training, unroll  # noqa: E402
+from rbd_jax.learn import TASKS, AutoReset, make, ppo, through, training, unroll, watch  # noqa: E402
 from rbd_jax.learn.tasks.push import FORCE, RADIUS, REACH  # noqa: E402
 from rbd_jax.mjcf import to_mjcf  # noqa: E402
+from rbd_jax.view import write_gif  # noqa: E402
 
 ROWS = ("throughput", "curves")
 #: Issue bar: environment steps per second on 2 cores.
@@ -184,7 +187,7 @@ def throughput(smoke: bool, repeats: int):
 # --- curves ---
 
 
-def curves(smoke: bool, tasks, seeds: int):
+def curves(smoke: bool, tasks, seeds: int, out: pathlib.Path):
     for name in tasks:
         task = make(name)
         chance = training.evaluate(task, training.at_random(task), jax.random.key(99))
@@ -207,6 +210,9 @@ def curves(smoke: bool, tasks, seeds: int):
                     "compile_s": total - history[-1].seconds, "lost": sum(p.lost_gradient for p in history),
                     "curve": seen[::every],
                 }  # fmt: skip
+                if kind == "ppo" and seed == 0 and not smoke:
+                    film = watch(task, got.policy, jax.random.key(7))
+                    write_gif(film, out / f"learning_{name}.gif", world=range(4), fps=10, width=320, height=200)
 
 
 # --- page ---
@@ -230,7 +236,7 @@ def latest(rows, row: str, keys) -> list[dict]:
     return list(found.values())
 
 
-def page(rows) -> str:
+def page(rows, place: pathlib.Path) -> str:
     out = ["# Learning", "", common.header(rows[-1]["environment"]), "Made by `benchmarks/learning.py`.", ""]
     speed = [r for r in latest(rows, "throughput", ("engine", "worlds")) if r["worlds"]]
     if speed:
@@ -270,6 +276,8 @@ def page(rows) -> str:
         about = "Final return: mean over seeds of 256 fresh episodes without exploration."
         picture = "![Reward against wall time and control steps](learning_curves.png)"
         out += ["## What is learned", "", about, "", common.table(heads, lines), "", picture, ""]
+        names = [t for t in dict.fromkeys(r["task"] for r in learned) if (place / f"learning_{t}.gif").is_file()]
+        out += [f"![{t}, four worlds after learning](learning_{t}.gif)\n" for t in names]
     return "\n".join(out)
 
 
@@ -328,13 +336,13 @@ def main(argv=None) -> int:
     same = {"environment": common.environment(), **({"smoke": True} if args.smoke else {})}
     parts = {
         "throughput": lambda: throughput(args.smoke, 1 if args.smoke else args.repeats),
-        "curves": lambda: curves(args.smoke, tasks, args.seeds),
+        "curves": lambda: curves(args.smoke, tasks, args.seeds, out),
     }
     for name in wanted if not args.report else ():
         for row in parts[name]():
             common.append_lines(out / "learning.jsonl", [{**row, **same}])
     rows = [json.loads(line) for line in (out / "learning.jsonl").read_text().splitlines()]
-    (out / "learning.md").write_text(page(rows), encoding="utf-8")
+    (out / "learning.md").write_text(page(rows, out), encoding="utf-8")
     draw(rows, out / "learning_curves.png")
     return 0
 

@@ -12,6 +12,7 @@ from .contact.sdf import sdf
 from .convert import from_mujoco, to_mujoco
 from .diagnostics import Contacts, SimulationError, check, contacts, energy, inertia_world, momentum, wrench_at
 from .estimate import memory_estimate
+from .farm import farm
 from .horizon import GradientNorms, gradient_norms
 from .longrun import long_rollout
 from .memory import MemoryEstimate
@@ -56,6 +57,7 @@ __all__ = [
     "check",
     "contacts",
     "energy",
+    "farm",
     "from_mujoco",
     "gathered",
     "gradient_norms",

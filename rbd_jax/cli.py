@@ -215,7 +215,8 @@ def _parser() -> argparse.ArgumentParser:
         "examples:\n"
         "  rbd-jax render dominoes -o dominoes.gif --seconds 3\n"
         "  rbd-jax render out.npz -o clip.mp4 --worlds 4\n\n"
-        "The ending of FILE says what is written: .png .gif .mp4 .html .glb (glTF) .usda (USD). No display needed.",
+        "The ending of FILE says what is written: .png .gif .mp4 .html .glb (glTF) .usda (USD) "
+        ".xml (keyframes for MuJoCo's viewer). No display needed.",
     )
     add_scene(sub, method="fast")
     sub.add_argument("-o", "--out", required=True, metavar="FILE", help="what to write")
@@ -274,13 +275,14 @@ def _parser() -> argparse.ArgumentParser:
         "train",
         _train,
         "learn a task by PPO, or by gradients through the simulator",
-        "example:\n  rbd-jax train push --seconds 20",
+        "example:\n  rbd-jax train push --seconds 20 --out push.gif",
     )
     sub.add_argument("task", metavar="TASK", help="push, catch, balance or topple")
     sub.add_argument("--learner", choices=("ppo", "through"), default="ppo", help="default ppo")
     sub.add_argument("--seconds", type=_number("> 0", "s"), metavar="T", help="wall time (default 20 without --steps)")
     sub.add_argument("--steps", type=_integer(1), metavar="N", help="control steps of all worlds")
     sub.add_argument("--seed", type=_integer(0), default=0, metavar="N", help="default 0")
+    sub.add_argument("--out", metavar="FILE", help="what the policy does in four worlds; endings as of render")
     sub.add_argument("--json", action="store_true", help="print the result as JSON")
 
     summary = "versions, devices, extras, shipped examples and presets"
@@ -541,29 +543,35 @@ def _write(args, model, traj, title: str, notes: dict, ghost=None) -> list[str]:
 
 
 def _render(args) -> int:
-    from .view import write_gif, write_glb, write_html, write_mp4, write_png, write_usda
-
-    movie = {"fps": args.fps, "speed": args.speed, "width": args.size[0], "height": args.size[1]}
-    still = {"width": args.size[0], "height": args.size[1]}
-    side = lambda film: range(film.shape[0])
-    writers = {
-        ".png": lambda film: write_png(film, args.out, world=side(film), **still),
-        ".gif": lambda film: write_gif(film, args.out, world=side(film), **movie),
-        ".mp4": lambda film: write_mp4(film, args.out, world=side(film), **movie),
-        ".html": lambda film: write_html(film, args.out),
-        ".glb": lambda film: write_glb(film, args.out),
-        ".usda": lambda film: write_usda(film, args.out),
-    }
-    ending = os.path.splitext(args.out)[1].lower()
-    if ending not in writers:
-        raise UsageError(
-            f"{args.out}: cannot write {ending or 'a file without an ending'}; known: {', '.join(writers)}"
-        )
+    write = _film_writer(args.out, args.size, fps=args.fps, speed=args.speed)
+    if os.path.abspath(args.out) == os.path.abspath(args.scene):
+        raise UsageError(f"cannot write {args.out}: it is the scene itself")
     _check_outputs(args.out)
     with _user_errors():
         film = _film_of_file(args) if args.scene.endswith(".npz") else _film_of_scene(args)
-        writers[ending](film)
+        write(film)
     return OK
+
+
+def _film_writer(path: str, size: tuple[int, int], **movie):
+    """film -> None, writes it as the ending of ``path`` says, its worlds side by side."""
+    from .view import write_gif, write_glb, write_html, write_mp4, write_png, write_replay, write_usda
+
+    still = {"width": size[0], "height": size[1]}
+    side = lambda film: range(film.shape[0])
+    writers = {
+        ".png": lambda film: write_png(film, path, world=side(film), **still),
+        ".gif": lambda film: write_gif(film, path, world=side(film), **still, **movie),
+        ".mp4": lambda film: write_mp4(film, path, world=side(film), **still, **movie),
+        ".html": lambda film: write_html(film, path),
+        ".glb": lambda film: write_glb(film, path),
+        ".usda": lambda film: write_usda(film, path),
+        ".xml": lambda film: write_replay(film, path),
+    }
+    ending = os.path.splitext(path)[1].lower()
+    if ending not in writers:
+        raise UsageError(f"{path}: cannot write {ending or 'a file without an ending'}; known: {', '.join(writers)}")
+    return writers[ending]
 
 
 def _film_of_scene(args):
@@ -600,10 +608,12 @@ def _train(args) -> int:
 
     import jax
 
-    from .learn import make, training
+    from .learn import make, training, watch
 
     with _user_errors():
         task = make(args.task)
+    write = _film_writer(args.out, (480, 320)) if args.out else None
+    _check_outputs(args.out)
     learner = importlib.import_module(f".learn.{args.learner}", __package__)
     seconds = args.seconds if args.seconds or args.steps else 20.0
     say = lambda p: print(
@@ -619,6 +629,9 @@ def _train(args) -> int:
         "learned": float(training.evaluate(task, got.policy, key).mean()),
         "chance": float(training.evaluate(task, training.at_random(task), key).mean()),
     }  # fmt: skip
+    if write is not None:
+        with _user_errors():
+            write(watch(task, got.policy, key))
     if args.json:
         print(_json(result))
     else:

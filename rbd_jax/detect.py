@@ -55,15 +55,19 @@ def detect(s: Structure, p: Params, world: World, reach_of_model: str) -> tuple[
     "all": every slot, however far (a distant row does nothing); "step": those that may touch
     within the step; "margin": those that touch, or are closer than MuJoCo's margin.
     """
-    reach = piece(_reach)(p, world) if reach_of_model == "step" or any(g.capacity for g in s.groups) else None
+    reach = None
+    if reach_of_model == "step" or any(g.capacity for g in s.groups):
+        reach, fall = piece(_reach)(p, world)
+        reach = reach if fall is None else reach + fall
     return tuple(_group(g, gp, p, world, i, reach, reach_of_model) for i, (g, gp) in enumerate(zip(s.groups, p.groups)))
 
 
-def _reach(p: Params, world: World) -> jax.Array:
-    """How far the surface of a body may come in a step, without its spin [m], (n, B)."""
-    bodies = world.bodies
-    g = 0.0 if p.gravity is None else p.h * safe_norm(p.gravity)
-    return p.h * (safe_norm(bodies.v) + g)
+def _reach(p: Params, world: World) -> tuple[jax.Array, jax.Array | None]:
+    """How far the surface of a body may come in a step, without its spin [m], (n, B), and how much farther by gravity.
+
+    Two results: a ``piece`` with one alone would not compile where it is large (see ``xla.one_function``).
+    """
+    return p.h * safe_norm(world.bodies.v), None if p.gravity is None else p.h * (p.h * safe_norm(p.gravity))
 
 
 def _sweep_of(p: Params, world: World) -> jax.Array:
@@ -232,20 +236,22 @@ def _group(g: Group, gp: GroupParams, p: Params, world: World, number: int, reac
     else:
         pairs, overflow = _choose(g, gp, p, world, reach)
         selected = chosen(g, gp, pairs)
-    margin = jnp.inf if reach_of_model == "all" else 0.0
-    if gp.law is not None:
-        margin = selected.numbers.law.margin
+    reaches = None
     if reach_of_model == "step" or (reach_of_model == "all" and g.capacity is not None):
         sides = ((side_of(g, "a"), selected.body_a), (side_of(g, "b"), selected.body_b))
         reaches = [take(reach, i) for c, i in sides if c == "dynamic"]
-        least = min_size(g.kind, selected.numbers.size_a, selected.numbers.size_b)
-        margin = piece(lambda least, reaches: SLOP * least + sum(reaches))(least, reaches)
         if g.choice is not None and g.category == "kinematic":
-            margin = margin + take(_sweep_of(p, world), selected.body_b if g.flip else selected.body_a)
-    if isinstance(margin, float):  # none, as the number that the narrow phase knows it by
-        m = piece(lambda selected, world, one: manifold(g, selected, world, margin, one))(selected, world, p.one)
-    else:
-        m = piece(lambda *args: manifold(g, *args))(selected, world, margin, p.one)
+            reaches.append(take(_sweep_of(p, world), selected.body_b if g.flip else selected.body_a))
+
+    def narrow(selected, world, reaches, one):
+        margin = jnp.inf if reach_of_model == "all" else 0.0
+        if reaches is not None:
+            margin = SLOP * min_size(g.kind, selected.numbers.size_a, selected.numbers.size_b) + sum(reaches)
+        elif gp.law is not None:
+            margin = selected.numbers.law.margin
+        return manifold(g, selected, world, margin, one)
+
+    m = piece(narrow)(selected, world, reaches, p.one)
     if g.choice is not None:  # the solver gathers from the rows: not the narrow phase again for each of them
         m = m._with(**materialise(dict(normal=m.normal, point=m.point, distance=m.distance), p.one))
     if g.padding is not None:

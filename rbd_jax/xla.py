@@ -96,6 +96,10 @@ def one_function(run, longest: int | None = None):
     operations is cut, so that only each ``piece`` of it is one.
 
     Forward only: loops in ``run`` may end early.
+
+    Raises:
+      TypeError: one operation, no loop, makes the only result, of DIVIDED elements or more. XLA divides such a one
+        among threads where it finds it worth while, and the emitter of one function then fails (invalid LLVM IR).
     """
 
     def call(*args):
@@ -109,6 +113,9 @@ def one_function(run, longest: int | None = None):
             # those that are used, and as XLA may find more than JAX to be of no use, all are results too
             short, used = dce_jaxpr(traced.jaxpr, [True] * len(traced.jaxpr.outvars))
             leaves = [c for c, u in zip(jax.tree.leaves(args), used, strict=True) if u]
+            if _would_be_divided(short):
+                name = getattr(run, "__name__", run)
+                raise TypeError(f"one_function: '{name}' has one result, made by one operation; see its docstring")
 
             def inner(*leaves):
                 return jax.core.eval_jaxpr(short, traced.consts, *leaves), leaves
@@ -123,6 +130,18 @@ def one_function(run, longest: int | None = None):
             return run(*args)
 
     return call
+
+
+#: Elements from which on XLA may divide an operation among threads.
+DIVIDED = 4096
+
+
+def _would_be_divided(jaxpr) -> bool:
+    """Whether one operation, which is no loop, makes the only result, and a large one."""
+    if len(jaxpr.outvars) != 1 or jaxpr.outvars[0].aval.size < DIVIDED:
+        return False
+    last = [e.primitive.name for e in jaxpr.eqns if jaxpr.outvars[0] in e.outvars]
+    return last not in (["while"], ["scan"], ["cond"], ["dynamic_update_slice"])
 
 
 def piece(run):

@@ -121,7 +121,13 @@ def test_the_gradient_contract_is_a_page(tmp_path):
     assert "| free flight |" in (tmp_path / "gradients.md").read_text()
 
 
-PAGES = (("scaling", "slope"), ("rooflines", "Gflop/s"), ("equal_error", "ratio"), ("accelerator", "bound"))
+PAGES = (
+    ("gradient_horizon", "median"),
+    ("scaling", "slope"),
+    ("rooflines", "Gflop/s"),
+    ("equal_error", "ratio"),
+    ("accelerator", "bound"),
+)
 
 
 @pytest.mark.parametrize("script, page", PAGES)
@@ -140,3 +146,12 @@ def test_learning_writes_rows(tmp_path):
     assert speed["ours"]["steps_per_s"] > 0 and speed["mujoco"]["steps_per_s"] > 0 and "brax" in " ".join(speed)
     assert {"chance", "ppo"} <= {r["learner"] for r in rows if r["row"] == "curve"}
     assert (tmp_path / "learning.md").exists()
+
+
+def test_people_writes_rows(tmp_path):
+    """A small page, and a run that is killed twice."""
+    done = run("people.py", "--smoke", "--rows", "page,kills", "--out", tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr[-3000:]
+    page, kills = (json.loads(line) for line in (tmp_path / "people.jsonl").read_text().splitlines())
+    assert page["megabytes"] < 5 and kills["end_same_bits"] and len(kills["killed_after_steps"]) == 2
+    assert "killed 2 times" in (tmp_path / "people.md").read_text()

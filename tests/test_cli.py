@@ -397,7 +397,8 @@ def test_save_load(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "ending, start", [("gif", b"GIF89a"), ("glb", b"glTF"), ("usda", b"#usda"), ("png", b"\x89PNG")]
+    "ending, start",
+    [("gif", b"GIF89a"), ("glb", b"glTF"), ("usda", b"#usda"), ("xml", b"<mujoco"), ("png", b"\x89PNG")],
 )
 def test_render_writes_what_the_ending_says(tmp_path, ending, start):
     pytest.importorskip("PIL")
@@ -418,6 +419,7 @@ def test_render_takes_what_run_wrote(tmp_path, capsys):
     for bad, message in (
         (["render", out, "-o", str(tmp_path / "a.xyz")], "cannot write .xyz; known: .png, .gif"),
         (["render", out, "-o", str(tmp_path / "no" / "a.png")], "does not exist"),
+        (["render", str(tmp_path / "s.xml"), "-o", str(tmp_path / "s.xml")], "is the scene itself"),
         (["render", str(tmp_path / "none.npz"), "-o", str(tmp_path / "a.png")], "none.npz"),
         (["render", "dominoes", "-o", str(tmp_path / "a.png"), "--size", "12"], "must be WIDTHxHEIGHT"),
     ):
@@ -425,9 +427,11 @@ def test_render_takes_what_run_wrote(tmp_path, capsys):
         assert message in capsys.readouterr().err
 
 
-def test_train_learns_and_says_so(capsys):
+def test_train_learns_and_says_so(capsys, tmp_path):
     pytest.importorskip("optax")
-    assert cli.main(["train", "push", "--learner", "through", "--steps", "40000", "--json"]) == 0
+    film = tmp_path / "push.glb"
+    command = ["train", "push", "--learner", "through", "--steps", "40000", "--json", "--out", str(film)]
+    assert cli.main(command) == 0 and film.read_bytes().startswith(b"glTF")
     told = json.loads(capsys.readouterr().out)
     assert told["task"] == "push" and told["steps"] >= 40_000 and told["learned"] > told["chance"]
     assert cli.main(["train", "juggle"]) == 2

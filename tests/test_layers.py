@@ -39,6 +39,7 @@ LAYER = {
     "convert": 8,
     "horizon": 8,
     "parity": 9,
+    "farm": 9,
     "learn": 9,
     "longrun": 9,
     "record": 9,
@@ -69,6 +70,8 @@ WITHIN = {
     ("audit", "diagnostics"),
     ("parity", "record"),
     ("longrun", "record"),
+    ("learn", "record"),
+    ("learn", "view"),
 }
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rbd_jax.learn import TASKS, AutoReset, make, ppo, through, training, unroll
+from rbd_jax.learn import TASKS, AutoReset, make, ppo, through, training, unroll, watch
 
 NAMES = sorted(TASKS)
 QUICK = ["push", "catch"]
@@ -400,3 +400,19 @@ def test_unroll_is_step_by_step(tasks):
         one, seen = step(one, 0.5 * jnp.ones((1, 2)))
         np.testing.assert_allclose(out.final_obs[k, 2], seen.final_obs[0], atol=2e-5)
         assert out.truncated[k, 2] == seen.truncated[0]
+
+
+def test_a_policy_is_watched(tasks):
+    """An episode a world, at the times of its steps, standing still once it is over; the first sample is the start."""
+    task = make("catch", episode=30)
+    film = watch(task, training.at_random(task), jax.random.key(3), worlds=3)
+    W, T, n = film.shape
+    assert W == 3 and 10 < T <= 31 and film.dynamic == task.model.n
+    np.testing.assert_allclose(film.time, task.period * np.arange(T), atol=1e-5)
+    moves = np.abs(np.diff(film.pos, axis=1)).max((2, 3)) > 0  # (world, interval)
+    assert moves[:, :5].all()
+    for world in moves:
+        assert not (np.diff(world.astype(int)) > 0).any(), "what stopped stays"
+    assert not moves[:, -1].all(), "the throws end at different times"
+    with pytest.raises(ValueError, match="worlds = 0"):
+        watch(task, training.at_random(task), jax.random.key(3), worlds=0)

@@ -221,6 +221,19 @@ def test_an_interrupted_run_goes_on(toys, tmp_path, monkeypatch):
     assert len({r["run"] for r in store.read(path)[0]}) == 2  # the one before was complete
 
 
+def test_a_part_of_a_run_does_not_end_it(toys, tmp_path, monkeypatch):
+    """Named cases of a run that was interrupted are measured as a part of it, and the rest goes on afterwards."""
+    short = lambda case, engine: plan.Job(case.name, engine.name, (("good", "float64"),), case.steps, ("good",), (1,))
+    monkeypatch.setitem(plan.SUITES, "smoke", short)
+    path = run.run(toys, tmp_path / "out", say=lambda _: None)
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    start = {**lines[0], "jobs": 2}  # as if two cases had been asked for
+    path.write_text(json.dumps(start) + "\n")
+    run.run(toys, tmp_path / "out", say=lambda _: None)
+    rows, _ = store.read(path)
+    assert [r["kind"] for r in rows] == ["start", "point", "point", "job"] and len({r["run"] for r in rows}) == 1
+
+
 def test_smoke_and_chart(tmp_path, capfd):
     out = ["--results", str(tmp_path)]
     assert cli(["bench", "--suite", "smoke", "--cases", "parabola", "--engines", "ours,mujoco,warp", *out]) == 0

@@ -145,6 +145,14 @@ def test_an_argument_that_nothing_uses_is_no_trouble():
     assert float(call(jnp.float32(3), jnp.arange(5.0))) == 6
 
 
+def test_a_large_single_result_is_refused():
+    """XLA 0.10 fails to compile it in some programs (64 balls, 1,024 worlds, 25 steps): the sum of reaches was one."""
+    x = jnp.ones((64, 128))
+    with pytest.raises(TypeError, match="has one result"):
+        one_function(lambda x: 0.01 * x + x)(x)
+    one_function(lambda x: (0.01 * x, x + 1))(x)
+
+
 def test_batch_axes_of_model_and_wrench_are_cut_too():
     model, one = rbd.build(SCENES["ball"], method="fast")
     mass = 1.0 + np.arange(300.0, dtype=np.float32)

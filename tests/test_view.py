@@ -481,10 +481,36 @@ def test_usd_holds_the_motion():
     assert stage.GetRootLayer().ImportFromString(text)
 
 
-def test_names_are_identifiers_and_unique():
-    from rbd_jax.view.usd import _names
+def test_mujoco_shows_the_motion_as_keyframes(tmp_path):
+    """Every geom of every world is where the clip has it, at every sample, and stays there."""
+    import mujoco
 
-    assert _names(["a b", "a_b", "", "7", "ä"]) == ["a_b", "a_b_2", "_", "_7", "__2"]
+    from rbd_jax.view import write_replay
+    from rbd_jax.view.clip import grid_offsets, rotate
+
+    clip = moving(W=2, T=4, n=3)
+    write_replay(clip, tmp_path / "a.xml")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "a.xml"))
+    data = mujoco.MjData(model)
+    assert model.nkey == 4
+    offsets = grid_offsets(2, *clip.bounds())
+    for t in range(4):
+        mujoco.mj_resetDataKeyframe(model, data, t)
+        mujoco.mj_step(model, data)
+        mujoco.mj_forward(model, data)
+        assert model.ngeom == 2 * len(clip.geoms)
+        for w, g in np.ndindex(2, len(clip.geoms)):
+            k, where = clip.body[g], clip.geom_pos[w, g]
+            if k >= 0:
+                where = clip.pos[w, t, k] + rotate(clip.quat[w, t, k], where)
+            distance = np.linalg.norm(data.geom_xpos - (where + offsets[w]), axis=1)
+            assert distance.min() < 1e-6, (t, w, g)
+
+
+def test_names_are_identifiers_and_unique():
+    from rbd_jax.view.clip import unique_names
+
+    assert unique_names(["a b", "a_b", "", "7", "ä"]) == ["a_b", "a_b_2", "_", "_7", "__2"]
 
 
 # --- forces of contact and another run, on the page ---

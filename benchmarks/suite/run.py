@@ -81,6 +81,7 @@ def run(choice: Choice, out: pathlib.Path, fresh: bool = False, say=print) -> pa
     machine = {k: same[k] for k in ("cpu", "cores", "platform")}
     name = None if fresh else unfinished(rows, choice.suite, machine)
     jobs = plan.jobs(choice.suite, cases, engines)
+    part = name is not None and any(r["kind"] == "start" and r["run"] == name and r["jobs"] > len(jobs) for r in rows)
     if name is None:
         name = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%SZ")
         store.append(rows_file, {**same, "kind": "start", "run": name, "suite": choice.suite, "jobs": len(jobs)})
@@ -104,7 +105,10 @@ def run(choice: Choice, out: pathlib.Path, fresh: bool = False, say=print) -> pa
             continue
         say(f"[{k}/{len(jobs)}, {time.perf_counter() - begin:.0f} s] {job.case} in {engines[job.engine].title}")
         _job(job, choice, rows_file, same | {"engine_version": engines[job.engine].version()}, say)
-    store.append(rows_file, {**same, "kind": "end"})
+    if part:
+        say(f"a part of the run of {name}; the rest is measured without naming cases and engines")
+    else:
+        store.append(rows_file, {**same, "kind": "end"})
     return rows_file
 
 

@@ -9,5 +9,6 @@
 
 from .environment import AutoReset, Environment, EnvState, Step, unroll
 from .tasks import TASKS, make
+from .watch import watch
 
-__all__ = ["AutoReset", "EnvState", "Environment", "Step", "TASKS", "make", "unroll"]
+__all__ = ["AutoReset", "EnvState", "Environment", "Step", "TASKS", "make", "unroll", "watch"]

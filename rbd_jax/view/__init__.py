@@ -9,6 +9,7 @@ from .gltf import write_glb
 from .html import write_html
 from .movie import pictures, write_gif, write_mp4
 from .png import encode_png, render, write_png
+from .replay import write_replay
 from .usd import write_usda
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "write_html",
     "write_mp4",
     "write_png",
+    "write_replay",
     "write_usda",
 ]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import html
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -261,6 +262,21 @@ def continuous(quat: np.ndarray) -> np.ndarray:
     flip = np.sum(quat[:, 1:] * quat[:, :-1], -1, keepdims=True) < 0
     sign = np.where(np.cumsum(flip, 1) % 2 == 1, -1.0, 1.0)
     return np.concatenate([quat[:, :1], quat[:, 1:] * sign], 1)
+
+
+def unique_names(labels) -> list[str]:
+    """Labels as identifiers (letters, digits and _, no digit first), made unique."""
+    seen, names = set(), []
+    for label in labels:
+        name = re.sub(r"\W", "_", str(label), flags=re.ASCII)
+        name = name if name and not name[0].isdigit() else f"_{name}"
+        unique, k = name, 1
+        while unique in seen:
+            k += 1
+            unique = f"{name}_{k}"
+        seen.add(unique)
+        names.append(unique)
+    return names
 
 
 def linear(colour: str) -> np.ndarray:

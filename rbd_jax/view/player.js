@@ -888,7 +888,11 @@ function tick(now) {
     }
     dirty = true;
   }
-  if (dirty) { dirty = false; draw(); }
+  if (dirty) {
+    dirty = false;
+    draw();
+    document.documentElement.dataset.drawn ??= Math.round(now); // since it was opened [ms], for who measures it
+  }
   requestAnimationFrame(tick);
 }
 

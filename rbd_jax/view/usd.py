@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import os
-import re
 
 import numpy as np
 
-from .clip import Clip, grid_offsets, linear
+from .clip import Clip, grid_offsets, linear, unique_names
 from .gltf import GROUND
 
 
@@ -60,7 +59,7 @@ def usda(clip: Clip) -> str:
             'uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:orient", "xformOp:scale"]')  # fmt: skip
         put(depth, "}")
 
-    worlds = _names(clip.worlds)
+    worlds = unique_names(clip.worlds)
     for w in range(W):
         put(1, f'def Xform "{worlds[w]}"', "{")
         put(
@@ -71,7 +70,7 @@ def usda(clip: Clip) -> str:
         # names of a world's children are unique among bodies and static geoms together
         fixed = [g for g in range(len(clip.geoms)) if clip.body[g] < 0]
         label = lambda g: clip.geoms[g].get("name") or clip.kind[g]
-        names = _names([*clip.names, *(label(g) for g in fixed)])
+        names = unique_names([*clip.names, *(label(g) for g in fixed)])
         for name, g in zip(names[n:], fixed):
             geom(2, w, g, name)
         for k in range(n):
@@ -81,24 +80,9 @@ def usda(clip: Clip) -> str:
                 f"quatf xformOp:orient.timeSamples = {{ {samples(clip.quat[w, :, k])} }}",
                 'uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:orient"]')  # fmt: skip
             mine = [g for g in range(len(clip.geoms)) if clip.body[g] == k]
-            for name, g in zip(_names([label(g) for g in mine]), mine):
+            for name, g in zip(unique_names([label(g) for g in mine]), mine):
                 geom(3, w, g, name)
             put(2, "}")
         put(1, "}")
     out.append("}")
     return "\n".join(out) + "\n"
-
-
-def _names(labels) -> list[str]:
-    """Labels as USD's identifiers, made unique."""
-    seen, names = set(), []
-    for label in labels:
-        name = re.sub(r"\W", "_", str(label), flags=re.ASCII)
-        name = name if name and not name[0].isdigit() else f"_{name}"
-        unique, k = name, 1
-        while unique in seen:
-            k += 1
-            unique = f"{name}_{k}"
-        seen.add(unique)
-        names.append(unique)
-    return names
