@@ -29,8 +29,9 @@ suppress_warnings = ["myst.xref_missing", "toc.not_included"]
 html_theme = "alabaster"
 html_theme_options = {
     "description": "Batched, differentiable rigid-body dynamics in JAX",
-    "page_width": "76rem",
-    "sidebar_width": "15rem",
+    "page_width": "1120px",
+    "body_max_width": "none",
+    "sidebar_width": "200px",
     "fixed_sidebar": True,
 }
 html_show_sourcelink = False
@@ -67,7 +68,7 @@ def lists(app, what, name, obj, options, lines):
             out += ["", f"**{heading[1]}**{heading[2]}", ""]
             inside = True
         elif inside and re.match(r"  \S", line):
-            out.append("* " + re.sub(r"^([\w, ]+):", r"**\1**:", line.strip()))
+            out.append("* " + re.sub(r"^(\w+(?:, \w+)*):(?= |$)", r"**\1**:", line.strip()))
         elif inside and line.startswith("   "):
             out.append("  " + line.strip())
         else:

@@ -199,10 +199,9 @@ def _orders(rows: list, cases, engines) -> list[str]:
             wanted = engines[c.engine].order(case, c.variant) if c.engine == OURS and OURS in engines else None
             if wanted is None:
                 continue
-            fit = c.order if c.order and c.order.slope is not None else c.self_order
+            fit = c.order or c.self_order
             if fit is None or fit.slope is None:
-                floor = fit or c.order
-                seen, verdict = "-", f"at its floor, {floor.floor:.1e}" if floor and floor.floor else "too few points"
+                seen, verdict = "-", f"at its floor, {fit.floor:.1e}" if fit and fit.floor else "too few points"
             else:
                 near = abs(fit.slope - wanted) <= NEAR
                 judged, met = judged + 1, met + near

@@ -12,7 +12,8 @@ from ..environment import Environment
 
 HALF = (0.08, 0.08, 0.12)
 COUNT = 3
-RADIUS = 0.1
+#: The ball meets the second box as well: the lowest alone is pushed along with all that stands on it.
+RADIUS = 0.3
 #: Largest force [N], on 2 kg.
 FORCE = 20.0
 TOP = 2 * COUNT * HALF[2]
