@@ -90,12 +90,15 @@ def heap(n: int) -> rbd.Scene:
     return rbd.Scene(bodies, static, dt=1 / 240)
 
 
-def opened(browser: str, address: str, scratch: pathlib.Path) -> tuple[float, str]:
-    """Wall seconds of a browser that opens a page, draws it and goes; what the page is then."""
+def opened(browser: str, address: str, scratch: pathlib.Path, budget: int = 300) -> tuple[float, str]:
+    """Wall seconds of a browser that opens a page, draws it and goes; what the page is then.
+
+    budget: of the page's own time [ms], which stands still while the processor works.
+    """
     begin = time.perf_counter()
     done = subprocess.run(
         [browser, "--headless", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader",
-         "--enable-unsafe-swiftshader", f"--user-data-dir={scratch / 'profile'}", "--virtual-time-budget=300",
+         "--enable-unsafe-swiftshader", f"--user-data-dir={scratch / 'profile'}", f"--virtual-time-budget={budget}",
          "--window-size=1280,800", "--dump-dom", address],
         capture_output=True, text=True, timeout=120,
     )  # fmt: skip
@@ -125,9 +128,11 @@ def page(smoke: bool, scratch: pathlib.Path) -> list[dict]:
         got = [opened(browser, name.as_uri(), scratch) for _ in range(repeats)]
         times[name] = statistics.median(t for t, _ in got)
         text = got[-1][1]
-    drawn = re.search(r'<html[^>]*data-drawn="(\d+)"', text)
-    row |= {"opens_s": times[file] - times[empty], "empty_s": times[empty], "drawn": drawn is not None}
-    row["ok"] = row["ok"] and row["drawn"] and row["opens_s"] <= 2.0
+    drawn = lambda text: re.search(r'<html[^>]*data-drawn="(\d+)"', text) is not None
+    if smoke and not drawn(text):  # a busy processor: the time means nothing, but the page must come
+        text = opened(browser, file.as_uri(), scratch, 10_000)[1]
+    row |= {"opens_s": times[file] - times[empty], "empty_s": times[empty], "drawn": drawn(text)}
+    row["ok"] = row["ok"] and row["drawn"] and (smoke or row["opens_s"] <= 2.0)
     return [row]
 
 

@@ -31,7 +31,7 @@ from .solvers.rows import Impulses, Index, Rows, take, take_tree
 from .spatial import Quat, Vec3, safe_norm
 from .state import World
 from .struct import struct
-from .xla import in_one_function, materialise, piece
+from .xla import in_one_function, largest, materialise, piece
 
 
 @struct
@@ -52,14 +52,41 @@ class Contact:
 def detect(s: Structure, p: Params, world: World, reach_of_model: str) -> tuple[Contact, ...]:
     """Contacts of every group, with the slots alive that the contact model wants.
 
-    "all": every slot, however far (a distant row does nothing); "step": those that may touch
-    within the step; "margin": those that touch, or are closer than MuJoCo's margin.
+    "all": every slot, however far (a distant row does nothing); "nearby": those that may touch within the step
+    whatever hits what in it; "step": those that may touch at the velocities of its start; "margin": those that
+    touch, or are closer than MuJoCo's margin.
     """
-    reach = None
+    reach = fastest = None
+    if reach_of_model == "nearby":
+        if sum(len(g.a) * g.slots for g in s.groups) > FEW:
+            fastest = piece(_fastest)(p, world)
+        else:
+            reach_of_model = "all"
     if reach_of_model == "step" or any(g.capacity for g in s.groups):
         reach, fall = piece(_reach)(p, world)
         reach = reach if fall is None else reach + fall
-    return tuple(_group(g, gp, p, world, i, reach, reach_of_model) for i, (g, gp) in enumerate(zip(s.groups, p.groups)))
+    return tuple(
+        _group(g, gp, p, world, i, reach, fastest, reach_of_model) for i, (g, gp) in enumerate(zip(s.groups, p.groups))
+    )
+
+
+#: "nearby" looks at all slots of a scene that has no more: to find out which are near costs as much.
+FEW = 8
+#: "nearby": how much faster than the fastest of its world a collision may make a body (twice: a light one, hit by a
+#: heavy one).
+FLUNG = 2.0
+
+
+def _fastest(p: Params, world: World) -> tuple[jax.Array, jax.Array]:
+    """The way of the fastest body of every world in the step, with its fall, [m], and the largest turn [rad]; (B,)."""
+    bodies = world.bodies
+    fall = 0.0 if p.gravity is None else p.h * safe_norm(p.gravity)
+    way = FLUNG * p.h * (largest(safe_norm(bodies.v)) + fall)
+    if bodies.L is None:
+        return way, 0.0 * way
+    moments = p.inertia.moments
+    least = moments if p.inertia.isotropic else jnp.minimum(jnp.minimum(moments.x, moments.y), moments.z)
+    return way, FLUNG * p.h * largest(safe_norm(bodies.L) / least)
 
 
 def _reach(p: Params, world: World) -> tuple[jax.Array, jax.Array | None]:
@@ -229,7 +256,7 @@ def rows_of(g: Group, selected: Selected, m: Manifold, world: World) -> Rows:
     )
 
 
-def _group(g: Group, gp: GroupParams, p: Params, world: World, number: int, reach, reach_of_model) -> Contact:
+def _group(g: Group, gp: GroupParams, p: Params, world: World, number: int, reach, fastest, reach_of_model) -> Contact:
     pairs = overflow = None
     if g.choice is None:
         selected = everything(g, gp)
@@ -237,7 +264,9 @@ def _group(g: Group, gp: GroupParams, p: Params, world: World, number: int, reac
         pairs, overflow = _choose(g, gp, p, world, reach)
         selected = chosen(g, gp, pairs)
     reaches = None
-    if reach_of_model == "step" or (reach_of_model == "all" and g.capacity is not None):
+    if fastest is not None and g.capacity is None:
+        reaches = _ways(g, selected, p, world, fastest)
+    elif reach_of_model != "margin" and (reach_of_model == "step" or g.capacity is not None):
         sides = ((side_of(g, "a"), selected.body_a), (side_of(g, "b"), selected.body_b))
         reaches = [take(reach, i) for c, i in sides if c == "dynamic"]
         if g.choice is not None and g.category == "kinematic":
@@ -261,6 +290,30 @@ def _group(g: Group, gp: GroupParams, p: Params, world: World, number: int, reac
     again = m.live & (last.n > 0)  # negative: an impact
     warm = jax.tree.map(lambda c: jnp.where(again, c, 0.0), last)
     return Contact(m, rows, last, warm, pairs, overflow, selected.numbers)
+
+
+def _ways(g: Group, selected: Selected, p: Params, world: World, fastest) -> list[jax.Array]:
+    """"nearby": how far the surface of each geom that moves may come in the step [m]."""
+    n, ways = selected.numbers, []
+    for side, size, local in (("a", n.size_a, n.local_a), ("b", n.size_b, n.local_b)):
+        category = side_of(g, side)
+        if category == "dynamic":
+            way, turn = fastest
+            ways.append(way[None])
+            radius = _radius(g.kind["ab".index(side)], size, local)
+            if radius is not None:
+                ways.append(turn[None] * radius)
+        elif category == "kinematic":
+            ways.append(take(_sweep_of(p, world), selected.body_b if g.flip else selected.body_a))
+    return ways
+
+
+def _radius(kind: str, size, local: Pose | None):
+    """Distance from the centre of mass to the farthest point of a geom that a turn moves [m]; None = none does."""
+    radius = None if kind == "sphere" else safe_norm(Vec3(*size))
+    if local is None:
+        return radius
+    return safe_norm(local.x) + (0.0 if radius is None else radius)
 
 
 def min_size(kind, size_a, size_b):

@@ -27,7 +27,7 @@ from .spatial import Quat, Vec3, components, where, zeros_like
 from .state import Memory, State, World, Wrench, to_hot, to_public
 from .status import Status
 from .struct import struct
-from .xla import materialise, opaque_one, piece, summed
+from .xla import materialise, opaque_one, part, piece, summed
 
 FROZEN = int(Status.NOT_FINITE)
 
@@ -417,7 +417,7 @@ def _solved(model: Model, p: Params, world: World, wrench: Wrench | None):
         world, left, more = _to_impacts(model, p, world, wrench)
         p, nominal = p._with(h=left), p.h
     old = world.bodies
-    contacts = detect(s, p, world, model.method.reach)
+    contacts = part(lambda p, world: detect(s, p, world, model.method.reach))(p, world)
     if nominal is not None:  # impulses are kept as those of a whole step
         rest = lambda c, meets: c._with(
             warm=jax.tree.map(lambda x: x * (p.h / nominal), c.warm),
@@ -429,7 +429,7 @@ def _solved(model: Model, p: Params, world: World, wrench: Wrench | None):
     problem = _problem(p, old, v, turning, contacts)._with(
         contact=model.method.contact, nominal=nominal, smoothing=p.smoothing
     )
-    solution = model.method.solver.solve(problem)
+    solution = part(model.method.solver.solve)(problem)
     if any(rows.e is not None and rows.slots > 1 for rows in problem.rows):
         solution = _passive(p, problem, solution)
     finish = lambda *args: _moved(integrator, *args)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import contextvars
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -46,6 +47,8 @@ def materialise_linear(tree, like: jax.Array, one):
 
 #: What is being traced becomes kernels, kernels and functions for its ``piece``s, or one function.
 _kind = contextvars.ContextVar("kind", default="kernels")
+#: Operations that a ``part`` may have to become one function.
+_longest_part = contextvars.ContextVar("longest_part", default=0)
 
 #: Operations that XLA's CPU backend can emit inside one function (not: sort, scatter, sums, linear algebra, callbacks).
 PLAIN = frozenset(
@@ -80,20 +83,21 @@ def loops_are_cheap() -> bool:
 
 
 @contextlib.contextmanager
-def _traced_as(kind: str):
-    token = _kind.set(kind)
+def _traced_as(kind: str, longest_part: int = 0):
+    tokens = _kind.set(kind), _longest_part.set(longest_part or _longest_part.get())
     try:
         yield
     finally:
-        _kind.reset(token)
+        _kind.reset(tokens[0])
+        _longest_part.reset(tokens[1])
 
 
-def one_function(run, longest: int | None = None):
+def one_function(run, longest: int | None = None, longest_part: int = 0):
     """``run``, compiled into one function of the CPU where its operations allow it; no effect elsewhere.
 
     XLA's CPU backend otherwise starts a kernel for every few operations, which takes longer than a kernel of a few
     hundred worlds. The time to compile a function grows faster than its length: one of more than ``longest``
-    operations is cut, so that only each ``piece`` of it is one.
+    operations is cut, so that only each ``piece`` of it is one, or each ``part`` of up to ``longest_part``.
 
     Forward only: loops in ``run`` may end early.
 
@@ -126,7 +130,7 @@ def one_function(run, longest: int | None = None):
             return jax.tree.structure(shape).unflatten(marked[0])
         if longest is None:
             return run(*args)
-        with _traced_as("pieces"):
+        with _traced_as("pieces", longest_part):
             return run(*args)
 
     return call
@@ -144,16 +148,21 @@ def _would_be_divided(jaxpr) -> bool:
     return last not in (["while"], ["scan"], ["cond"], ["dynamic_update_slice"])
 
 
-def piece(run):
+def piece(run, longest: int | None = None):
     """``run(*args)``, one function where the program around it is cut into pieces; else a part of that program."""
 
     def call(*args):
         if _kind.get() != "pieces":
             return run(*args)
         with _traced_as("kernels"):
-            return one_function(run)(*args)
+            return one_function(run, longest)(*args)
 
     return call
+
+
+def part(run):
+    """As ``piece``, of what is itself made of pieces: those are the functions where it is long."""
+    return lambda *args: piece(run, _longest_part.get())(*args)
 
 
 def _length(jaxpr) -> int | None:
@@ -198,11 +207,20 @@ UNROLL = 16
 
 def summed(c: jax.Array, axis: int = 0) -> jax.Array:
     """The sum of ``c`` over one axis; XLA's own sums have no place in one function."""
+    return _reduced(c, axis, jnp.sum, jnp.add)
+
+
+def largest(c: jax.Array, axis: int = 0) -> jax.Array:
+    """The largest of ``c`` over one axis, see ``summed``."""
+    return _reduced(c, axis, jnp.max, jnp.maximum)
+
+
+def _reduced(c: jax.Array, axis: int, whole, both) -> jax.Array:
     count = c.shape[axis]
     if not in_one_function() or not count:
-        return c.sum(axis=axis)
+        return whole(c, axis=axis)
     if count <= UNROLL:
         parts = [jax.lax.index_in_dim(c, k, axis, keepdims=False) for k in range(count)]
-        return sum(parts[1:], parts[0])
+        return functools.reduce(both, parts)
     at = lambda k: jax.lax.dynamic_index_in_dim(c, k, axis, keepdims=False)
-    return jax.lax.fori_loop(1, count, lambda k, total: total + at(k), at(0))
+    return jax.lax.fori_loop(1, count, lambda k, total: both(total, at(k)), at(0))

@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..loops import Listed, listed
+from ..loops import Listed, listed, only_if, repeat
 from ..spatial import Vec3
 from ..struct import struct
-from ..xla import in_one_function, materialise, piece, summed
+from ..xla import in_one_function, loops_are_cheap, materialise, piece, summed
 from .base import Problem, Solution
 from .colouring import Plan, plan
 from .laws import Law
@@ -26,6 +26,8 @@ from .rows import Impulses, Index, Rows, add_rows, take, take_tree
 
 #: Groups with more rows than this (slots x colours) loop over their slots instead of unrolling them.
 UNROLL = 4
+#: Worlds from which on a program need not be short: what it computes takes longer than what it starts.
+FEW = 32
 #: Groups with more colours than this loop over them too: 16 balls compile in a fifth of the time.
 UNROLL_COLOURS = 8
 
@@ -246,15 +248,54 @@ def _couple(g: Group, lam: Impulses) -> Vec3:
     return c if lam.r1 is None else c + g.t1 * lam.r1 + g.t2 * lam.r2
 
 
+def started(problem: Problem):
+    """Groups, the impulses to start from, and the velocities that these give."""
+    groups = tuple(piece(prepare)(rows, problem.without_rows()) for rows in problem.rows)
+    lam = tuple(arranged(l, g.plan) for g, l in zip(groups, problem.warm))
+    body = (problem.v, problem.w)
+    for g, l in zip(groups, lam):
+        body = piece(apply)(g, l, body)
+    return groups, lam, materialise(body, problem.one)
+
+
+def in_phases(groups, soft, relaxed, lam, body, one, counts: tuple[int, int]):
+    """``counts[0]`` sweeps with the laws ``soft``, then ``counts[1]`` with ``relaxed(body, lam)``.
+
+    Returns the velocities and impulses of the end, and the velocities after the first phase. Of few worlds, whose
+    program is long if it is to be fast, both phases are turns of one loop, which halves it (and takes a tenth longer).
+    """
+    if not loops_are_cheap() or groups[0].rows.phi.shape[-1] >= FEW:
+        moving, lam = sweeps(groups, soft, lam, body, one, counts[0])
+        body, lam = sweeps(groups, relaxed(moving, lam), lam, moving, one, counts[1])
+        return body, lam, moving
+    wide = lambda g, tree: jax.tree.map(lambda c: jnp.broadcast_to(c, g.rows.phi.shape).astype(g.rows.phi.dtype), tree)
+    whole = lambda trees: tuple(wide(g, tree) for g, tree in zip(groups, trees))
+    body = jax.tree.map(lambda c: jnp.broadcast_to(c, (c.shape[0], groups[0].rows.phi.shape[-1])), body)
+
+    def phase(k, carry):
+        body, lam, laws, _ = carry
+        once = lambda _, carry: _once(groups, laws, one, *carry)
+        body, lam = repeat(0, jnp.where(k == 0, *counts), once, (body, lam))
+        turn = lambda carry: (whole(relaxed(body, lam)), body)
+        laws, moving = only_if((k == 0).astype(jnp.int32), turn, (laws, carry[3]))
+        return body, lam, laws, moving
+
+    body, lam, _, moving = repeat(0, 2, phase, (body, whole(lam), whole(soft), body))
+    return body, lam, moving
+
+
+def _once(groups, laws, one, body, lam):
+    """One sweep over all groups."""
+    lam = list(lam)
+    for k, g in enumerate(groups):
+        body, lam[k] = piece(sweep)(g, laws[k], lam[k], body, one)
+    return body, tuple(lam)
+
+
 def sweeps(groups, laws, lam, body, one, count: int):
     """``count`` sweeps over all groups; many, or with chunks, whose program is long, in a compiled loop."""
 
-    def once(carry, _):
-        body, lam = carry
-        lam = list(lam)
-        for k, g in enumerate(groups):
-            body, lam[k] = piece(sweep)(g, laws[k], lam[k], body, one)
-        return (body, tuple(lam)), None
+    once = lambda carry, _: (_once(groups, laws, one, *carry), None)
 
     carry = (body, tuple(lam))
     rolled = any(g.plan is not None or g.points is not None for g in groups)

@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import dataclasses
 
-from ..xla import materialise, piece
+from ..xla import part
 from .base import Problem, Solution, Solver
-from .gauss_seidel import apply, arranged, biased, prepare, solution, sweeps
+from .gauss_seidel import biased, solution, started, sweeps
 from .laws import contact_model
 
 
@@ -34,11 +34,7 @@ class PGS(Solver):
 
     def solve(self, problem: Problem) -> Solution:
         model, one = contact_model(self, problem), problem.one
-        groups = [piece(prepare)(rows, problem.without_rows()) for rows in problem.rows]
-        body = (problem.v, problem.w)
-        warm = [arranged(l, g.plan) for g, l in zip(groups, problem.warm)]
-        for g, l in zip(groups, warm):
-            body = piece(apply)(g, l, body)
+        groups, warm, body = part(started)(problem)
         laws = [biased(g, model.law(g.rows, g.k_n, problem)) for g in groups]
-        body, lam = sweeps(groups, laws, warm, materialise(body, one), one, self.sweeps)
+        body, lam = sweeps(groups, laws, warm, body, one, self.sweeps)
         return solution(problem, groups, body, lam)

@@ -13,10 +13,10 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from ..xla import materialise, piece
+from ..xla import part
 from . import single
 from .base import Problem, Solution, Solver
-from .gauss_seidel import apply, arranged, biased, prepare, relaxing, solution, sweeps
+from .gauss_seidel import biased, in_phases, relaxing, solution, started, sweeps
 from .laws import Law, contact_model
 from .restitution import normal_velocity, targets
 from .rows import Impulses, Rows
@@ -48,20 +48,17 @@ class TGS(Solver):
         model = contact_model(self, problem)
         if single.applies(problem):
             return single.solve(problem, model)
+        groups, lam, body = part(started)(problem)
+        return part(lambda *args: self._swept(model, *args))(problem, groups, lam, body)
+
+    def _swept(self, model, problem: Problem, groups, lam, body) -> Solution:
         one = problem.one
-        groups = [piece(prepare)(rows, problem.without_rows()) for rows in problem.rows]
-        lam = [arranged(l, g.plan) for g, l in zip(groups, problem.warm)]
-        body = (problem.v, problem.w)
-        for g, l in zip(groups, lam):
-            body = piece(apply)(g, l, body)
-        body = materialise(body, one)
-        soft = [biased(g, model.law(g.rows, g.k_n, problem)) for g in groups]
-        body, lam = sweeps(groups, soft, lam, body, one, self.sweeps)
+        soft = tuple(biased(g, model.law(g.rows, g.k_n, problem)) for g in groups)
         if model.physical:
+            body, lam = sweeps(groups, soft, lam, body, one, self.sweeps)
             return solution(problem, groups, body, lam)
-        moving = body
-        hard = [relaxing(g, l, moving, problem.h) for g, l in zip(groups, lam)]
-        body, lam = sweeps(groups, hard, lam, body, one, self.relax)
+        relaxed = lambda body, lam: tuple(relaxing(g, l, body, problem.h) for g, l in zip(groups, lam))
+        body, lam, moving = in_phases(groups, soft, relaxed, lam, body, one, (self.sweeps, self.relax))
         return solution(problem, groups, body, lam, moving)
 
     def final_law(self, rows: Rows, p: Impulses, w, problem: Problem, solution: Solution, load) -> Law:

@@ -46,8 +46,8 @@ class ContactModel:
     """A contact model: a frozen (hashable, static) dataclass of its constants."""
 
     name: ClassVar[str]
-    #: which slots it wants: "all" however far, "step" those that may touch within the step,
-    #: "margin" those closer than their margin.
+    #: which slots it wants: "nearby" those that may touch within the step whatever hits what in it, "step" those
+    #: that may touch at the velocities of its start, "margin" those closer than their margin, "all" however far.
     reach: ClassVar[str] = "step"
     #: whether the compliance is the material's. If not, it is a means to be stable, and a solver may take out
     #: of the velocities what it adds to recover from overlap.

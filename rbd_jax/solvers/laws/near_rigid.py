@@ -65,7 +65,7 @@ class Baumgarte(ContactModel):
     push_speed: float = 3.0
 
     name = "baumgarte"
-    reach = "all"
+    reach = "nearby"
 
     def law(self, rows, w, problem, load=None) -> Law:
         return Law(recovery(rows.phi, problem, self.fraction, self.push_speed))

@@ -28,7 +28,7 @@ class Soft(ContactModel):
     push_speed: float = 2.0
 
     name = "soft"
-    reach = "all"
+    reach = "nearby"
 
     def law(self, rows, w, problem, load=None) -> Law:
         om = 2.0 * math.pi * self.stiffness
