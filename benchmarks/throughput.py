@@ -25,7 +25,7 @@ _parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
 _parser.add_argument("--smoke", action="store_true", help="a few seconds: one scene, few worlds and steps")
 _parser.add_argument("--devices", type=int, default=1, metavar="N", help="host devices to shard the batch over")
 _parser.add_argument("--scenes", default="", metavar="A,B", help="only these scenes")
-_parser.add_argument("--mjx", action="store_true", help="MJX too, where it is installed (ten minutes more)")
+_parser.add_argument("--rivals", action="store_true", help="MJX and Brax too, where they are (ten minutes more)")
 _parser.add_argument("--repeats", type=int, default=5, metavar="N", help="timed runs of each side (default 5)")
 _parser.add_argument("--out", type=pathlib.Path, default=None, metavar="DIR", help="default benchmarks/results")
 if __name__ == "__main__":
@@ -36,6 +36,7 @@ if __name__ == "__main__":
         )
 
 import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
@@ -188,7 +189,6 @@ TITLES = {
 }
 TEN_BOX_COMPILE = 10.0
 OVERHEAD_BAR = 1.5
-MJX_BAR = 50.0  # scenes of five or more bodies; elsewhere faster at all
 
 
 # --- timing ---
@@ -373,10 +373,10 @@ def free_errors(name, rival, model, one, size, worlds, args):
     }  # fmt: skip
 
 
-# --- MJX, where it is installed ---
+# --- MJX and Brax, where they are installed ---
 
 #: scene: (batches, steps timed); a scene of several bodies is slow enough that few steps tell.
-MJX = {
+RIVAL_RUNS = {
     "ball": ((256, 1024, 4096), 100),
     "isotropic": ((256, 1024, 4096), 100),
     "asymmetric": ((256, 1024, 4096), 100),
@@ -387,35 +387,58 @@ MJX = {
 }
 
 
-def mjx_rows(name, args, env):
-    """Rows of MJX on the same scene and start states: its best batch; an error it raises is kept as the reason."""
+def mjx(scene, steps):
+    """(model, states) -> (function of MJX, its arguments)."""
     import gradients  # what it needs of MJX is there
 
-    mjx = gradients.mjx_module()
-    same = {**env, "benchmark": "mjx", "scene": name, "dt": DT, "dtype": "float32"}
-    if mjx is None:
-        return [{**same, "reason": gradients.NO_MJX}]
+    if gradients.mjx_module() is None:
+        raise ImportError(gradients.NO_MJX)
+    m, d = gradients.mjx_model(scene, DT)
+    run = jax.vmap(lambda q, v: gradients.mjx_end(m, d.replace(qpos=q, qvel=v), steps).qpos)
+    return lambda model, states: (run, rbd.to_mujoco(model, states))
+
+
+def brax(pipeline):
+    """As ``mjx``, with one of Brax's pipelines."""
+
+    def made(scene, steps):
+        from suite.engines.brax import Program
+
+        program = Program(rbd.to_mjcf(scene), pipeline)
+        run = jax.vmap(lambda *start: program.after(jnp.float32(DT), program.start(*start), steps).x.pos)
+        return lambda model, states: (run, [states.pos, states.quat, states.vel, states.omega])
+
+    return made
+
+
+#: name: (title, maker, bar of the ratio: many bodies, few)
+RIVALS = {
+    "mjx": ("MJX", mjx, (50.0, 1.0)),
+    "brax_spring": ("Brax, spring", brax("spring"), (1.0, 1.0)),
+    "brax_positional": ("Brax, positional", brax("positional"), (1.0, 1.0)),
+}
+
+
+def rival_rows(rival, name, env):
+    """Rows of another engine on the same scene and start states: its best batch; an error is kept as the reason."""
+    same = {**env, "benchmark": rival, "scene": name, "dt": DT, "dtype": "float32"}
     scene, worlds = SCENES[name][0]()
     model, one = rbd.build(scene, dt=DT, method="fast")
-    batches, steps = MJX[name]
+    batches, steps = RIVAL_RUNS[name]
     rows = []
     for size in batches:
-        qpos, qvel = rbd.to_mujoco(model, worlds(one, size, np.random.default_rng(1)))
         try:
-            m, d = gradients.mjx_model(scene, DT)
-            run = jax.vmap(lambda q, v, m=m, d=d: gradients.mjx_end(m, d.replace(qpos=q, qvel=v), steps).qpos)
+            run, start = RIVALS[rival][1](scene, steps)(model, worlds(one, size, np.random.default_rng(1)))
             begin = time.perf_counter()
-            compiled = jax.jit(run).lower(qpos, qvel).compile()
+            compiled = jax.jit(run).lower(*start).compile()
             compile_s = time.perf_counter() - begin
-            (times,) = in_turn([lambda: jax.block_until_ready(compiled(qpos, qvel))], 3)
+            (times,) = in_turn([lambda: jax.block_until_ready(compiled(*start))], 3)
         except Exception as error:
             return [*rows, {**same, "batch": size, "reason": f"{type(error).__name__}: {str(error)[:200]}"}]
         rows.append({**same, "batch": size, "steps": steps, **spread(times), "compile_s": compile_s,
                      "ns_per_world_step": 1e9 * np.median(times) / size / steps})  # fmt: skip
-        print(
-            f"{name:11s} MJX       {size:6d} {rows[-1]['ns_per_world_step']:9.0f} ns  compile {compile_s:.1f} s",
-            flush=True,
-        )
+        took = rows[-1]["ns_per_world_step"]
+        print(f"{name:11s} {rival:15s} {size:6d} {took:9.0f} ns  compile {compile_s:.1f} s", flush=True)
     return rows
 
 
@@ -468,7 +491,7 @@ def report(env, rows, extra, seconds):
         )  # fmt: skip
     compiles = []
     for r in rows:
-        if r["benchmark"] == "mjx" or (not r.get("best", True) and r["batch"] != LEAST):
+        if r["benchmark"] in RIVALS or (not r.get("best", True) and r["batch"] != LEAST):
             continue
         bar = TEN_BOX_COMPILE if r["scene"] == "ten_boxes" else SCENES[r["scene"]][6]
         bar = bar if r["method"] == "fast" else None
@@ -493,24 +516,25 @@ def report(env, rows, extra, seconds):
         for v in rows_of_scene
     ]
     rivals = []
-    for name in {r["scene"]: None for r in rows if r["benchmark"] == "mjx"}:
+    for name, rival in {(r["scene"], r["benchmark"]): None for r in rows if r["benchmark"] in RIVALS}:
+        title, _, bars = RIVALS[rival]
         mine = min(r["ns_per_world_step"] for r in timed if r["scene"] == name and r["method"] == "fast")
-        theirs = [r for r in rows if r["benchmark"] == "mjx" and r["scene"] == name]
+        theirs = [r for r in rows if r["benchmark"] == rival and r["scene"] == name]
         done = [r for r in theirs if "ns_per_world_step" in r]
-        bar = MJX_BAR if name in ("stack", "clutter", "pile16") else 1.0
+        bar = bars[0 if name in ("stack", "clutter", "pile16") else 1]
         if done:
             top = min(done, key=lambda r: r["ns_per_world_step"])
             ratio = top["ns_per_world_step"] / mine
             rivals.append(
-                [TITLES[name], f"{top['batch']:,}", number(top["ns_per_world_step"]), number(top["compile_s"])]
+                [TITLES[name], title, f"{top['batch']:,}", number(top["ns_per_world_step"]), number(top["compile_s"])]
                 + [number(mine), f"**{number(ratio)}**", f"{bar:g}", verdict(ratio, bar, least=True)]
             )
         for r in theirs:
             if "reason" in r:
-                rivals.append([TITLES[name], r.get("batch", "-"), r["reason"], "-", number(mine), "-", "-", "-"])
+                rivals.append([TITLES[name], title, r["batch"], r["reason"], "-", number(mine), "-", "-", "-"])
     rivals = (
-        "## MJX on the same cores\n\nIts best batch, float32, same MJCF and start states.\n\n"
-        + common.table(["scene", "batch", "MJX [ns]", "compile [s]", "ours [ns]", "ratio", "bar", ""], rivals)
+        "## MJX and Brax on the same cores\n\nTheir best batch, float32, same MJCF and start states.\n\n"
+        + common.table(["scene", "engine", "batch", "it [ns]", "compile [s]", "ours [ns]", "ratio", "bar", ""], rivals)
         if rivals
         else ""
     )
@@ -587,8 +611,8 @@ def main(args) -> int:
         keep(measure(name, "fast", batches, args, env, steps, mj_worlds))
         if not args.smoke and accurate:
             keep(measure(name, "accurate", (accurate,), args, env, steps, mj_worlds))
-        if args.mjx and name in MJX:
-            new = mjx_rows(name, args, env)
+        for rival in RIVALS if args.rivals and name in RIVAL_RUNS else ():
+            new = rival_rows(rival, name, env)
             rows.extend(new)
             common.append_lines(out / "throughput.jsonl", new)
         if name in ("ball", "box", "stack") and args.devices == 1:

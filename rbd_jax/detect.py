@@ -293,7 +293,7 @@ def _group(g: Group, gp: GroupParams, p: Params, world: World, number: int, reac
 
 
 def _ways(g: Group, selected: Selected, p: Params, world: World, fastest) -> list[jax.Array]:
-    """"nearby": how far the surface of each geom that moves may come in the step [m]."""
+    """How far the surface of each geom that moves may come in the step, whatever hits its body [m]."""
     n, ways = selected.numbers, []
     for side, size, local in (("a", n.size_a, n.local_a), ("b", n.size_b, n.local_b)):
         category = side_of(g, side)
@@ -304,13 +304,27 @@ def _ways(g: Group, selected: Selected, p: Params, world: World, fastest) -> lis
             if radius is not None:
                 ways.append(turn[None] * radius)
         elif category == "kinematic":
-            ways.append(take(_sweep_of(p, world), selected.body_b if g.flip else selected.body_a))
+            ways.append(_swept_at(g, selected, p, world))
     return ways
+
+
+def _swept_at(g: Group, selected: Selected, p: Params, world: World) -> jax.Array:
+    """How far a kinematic body goes in a step where the other body of the pair is [m], its turn with it; (P, B)."""
+    ends, sizes = (selected.body_a, selected.body_b), (selected.numbers.size_a, selected.numbers.size_b)
+    mine, other = (1, 0) if g.flip else (0, 1)
+    k = take_tree(world.kinematic, ends[mine])
+    arm = safe_norm(take_tree(world.bodies.x, ends[other]) - k.x) + _extent(sizes[other])
+    return p.h * (safe_norm(k.v) + safe_norm(k.w) * arm)
+
+
+def _extent(size) -> jax.Array:
+    """Distance from the centre of a sphere or box to its farthest point [m]."""
+    return size[0] if len(size) == 1 else safe_norm(Vec3(*size))
 
 
 def _radius(kind: str, size, local: Pose | None):
     """Distance from the centre of mass to the farthest point of a geom that a turn moves [m]; None = none does."""
-    radius = None if kind == "sphere" else safe_norm(Vec3(*size))
+    radius = None if kind == "sphere" else _extent(size)
     if local is None:
         return radius
     return safe_norm(local.x) + (0.0 if radius is None else radius)

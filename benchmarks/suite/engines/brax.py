@@ -67,7 +67,7 @@ def mjcf(case: Case) -> str:
     )
 
 
-class _Program:
+class Program:
     """Compiled functions of a scene: JAX keeps one of each per number of worlds. The step is an argument."""
 
     def __init__(self, text: str, variant: str):
@@ -92,11 +92,12 @@ class _Program:
             at = system.replace(opt=system.opt.replace(timestep=dt))
             return jax.lax.fori_loop(0, steps, lambda _, s: pipeline.step(at, s, act), state)
 
+        self.start, self.after = first, advance  # of one world
         self.first = jax.jit(jax.vmap(first))
         self.advance = jax.jit(jax.vmap(advance, in_axes=(None, 0, None)))
 
 
-_program = functools.lru_cache(maxsize=8)(_Program)
+_program = functools.lru_cache(maxsize=8)(Program)
 
 
 class _Simulation(Simulation):
