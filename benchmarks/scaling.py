@@ -113,10 +113,10 @@ def contacts_rows(args):
 
 
 def latency_rows(args):
-    for name in ("ball",) if args.smoke else ("ball", "isotropic", "asymmetric", "box", "stack", "pile16"):
+    for name in ("ball",) if args.smoke else ("ball", "isotropic", "asymmetric", "box", "stack", "clutter", "pile16"):
         scene, worlds = throughput.SCENES[name][0]()
         for method in ("fast",) if args.smoke else ("fast", "accurate"):
-            if method == "accurate" and name in ("pile16", "isotropic", "asymmetric"):
+            if method == "accurate" and name in ("clutter", "pile16", "isotropic", "asymmetric"):
                 continue
             model, one = rbd.build(scene, dt=throughput.DT, method=method)
             state = jax.tree.map(lambda c: c[0], worlds(one, 1, np.random.default_rng(1)))
