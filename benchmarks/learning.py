@@ -308,6 +308,7 @@ def draw(rows, path: pathlib.Path) -> None:
                 ax.axhline(chance, color="0.5", ls=":", lw=1, label="chance")
             ax.set_xlabel("wall time of learning [s]" if key else "control steps")
             ax.set_xscale("log")
+            ax.xaxis.set_minor_formatter("")  # a chart of one decade would label every tick
             ax.grid(alpha=0.3)
         column[0].set_title(task)
     for row in axes:
