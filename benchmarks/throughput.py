@@ -404,7 +404,8 @@ def brax(pipeline):
     def made(scene, steps):
         from suite.engines.brax import Program
 
-        program = Program(rbd.to_mjcf(scene), pipeline)
+        # Brax reads no other cone, and its pipelines use neither
+        program = Program(rbd.to_mjcf(scene).replace('cone="elliptic"', 'cone="pyramidal"'), pipeline)
         run = jax.vmap(lambda *start: program.after(jnp.float32(DT), program.start(*start), steps).x.pos)
         return lambda model, states: (run, [states.pos, states.quat, states.vel, states.omega])
 
