@@ -22,10 +22,12 @@ from .contact.broadphase import (
     half_widths,
     key_of,
     lookup,
+    lookup_of_one,
     no_key,
+    pairs_of_one,
     rows_of_key,
 )
-from .loops import each_pair
+from .loops import BLOCK, each_pair, in_blocks, listed, repeat
 from .model import Coefficient, Group, GroupParams, Params, Structure
 from .solvers.rows import Impulses, Index, Rows, take, take_tree
 from .spatial import Quat, Vec3, safe_norm
@@ -37,7 +39,8 @@ from .xla import in_one_function, largest, materialise, piece
 @struct
 class Contact:
     """A group in one step: its manifold, rows, impulses of the last step, those to start from, the keys of the
-    pairs that were chosen and whether there were too many, and the numbers of its pairs.
+    pairs that were chosen and whether there were too many, and the numbers of its pairs. places: of one world, of a
+    group that looks at all its pairs: which of them these are.
     """
 
     manifold: Manifold
@@ -47,6 +50,7 @@ class Contact:
     pairs: jax.Array | None
     overflow: jax.Array | None
     numbers: GroupParams
+    places: jax.Array | None = None
 
 
 def detect(s: Structure, p: Params, world: World, reach_of_model: str) -> tuple[Contact, ...]:
@@ -56,6 +60,7 @@ def detect(s: Structure, p: Params, world: World, reach_of_model: str) -> tuple[
     whatever hits what in it; "step": those that may touch at the velocities of its start; "margin": those that
     touch, or are closer than MuJoCo's margin.
     """
+    alone = s.chooses and in_one_function() and world.step.shape == (1,)
     reach = fastest = None
     if reach_of_model == "nearby":
         if sum(len(g.a) * g.slots for g in s.groups) > FEW:
@@ -66,7 +71,8 @@ def detect(s: Structure, p: Params, world: World, reach_of_model: str) -> tuple[
         reach, fall = piece(_reach)(p, world)
         reach = reach if fall is None else reach + fall
     return tuple(
-        _group(g, gp, p, world, i, reach, fastest, reach_of_model) for i, (g, gp) in enumerate(zip(s.groups, p.groups))
+        _group(g, gp, p, world, i, reach, fastest, reach_of_model, alone)
+        for i, (g, gp) in enumerate(zip(s.groups, p.groups))
     )
 
 
@@ -107,7 +113,8 @@ class Selected:
     """The pairs of a group that are looked at: their bodies and numbers, (P, 1 or B).
 
     body_a, body_b: as in ``Rows``, of the geoms A and B. places: which of the group's pairs they are where
-    that differs from world to world, (P, B), else None. filled: places that hold a pair, None = all.
+    that differs from world to world, (P, B), else None. filled: places that hold a pair, None = all; count: how many,
+    of one world, where all the others come behind them, int32 ().
     """
 
     body_a: Index | jax.Array
@@ -115,6 +122,7 @@ class Selected:
     numbers: GroupParams
     places: jax.Array | None = None
     filled: jax.Array | None = None
+    count: jax.Array | None = None
 
 
 def everything(g: Group, gp: GroupParams) -> Selected:
@@ -130,8 +138,11 @@ def chosen(g: Group, gp: GroupParams, keys: jax.Array) -> Selected:
     i, j = geoms_of(g, keys)
     body = lambda rows, k: jnp.asarray(np.maximum(rows, 0), jnp.int32)[k]
     c = g.choice
-    filled = keys < no_key(len(c.a), len(c.b))
-    return Selected(body(c.body_a, i), body(c.body_b, j), _numbers(g, gp, i, j), keys, filled)
+    none = no_key(len(c.a), len(c.b))
+    count = None
+    if in_one_function() and keys.shape[1] == 1:
+        count = below(keys, jnp.full((1, 1), none, jnp.int32))[0, 0]
+    return Selected(body(c.body_a, i), body(c.body_b, j), _numbers(g, gp, i, j), keys, keys < none, count)
 
 
 def geoms_of(g: Group, keys: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -248,6 +259,7 @@ def rows_of(g: Group, selected: Selected, m: Manifold, world: World) -> Rows:
         mu_spin=numbers.mu_spin,
         mu_roll=numbers.mu_roll,
         surface_spin=surface_spin,
+        filled=selected.count,
         feature=m.feature if g.features else None,
         law=numbers.law,
         central_a=g.central_a and index_a is not None,
@@ -256,7 +268,9 @@ def rows_of(g: Group, selected: Selected, m: Manifold, world: World) -> Rows:
     )
 
 
-def _group(g: Group, gp: GroupParams, p: Params, world: World, number: int, reach, fastest, reach_of_model) -> Contact:
+def _group(
+    g: Group, gp: GroupParams, p: Params, world: World, number: int, reach, fastest, reach_of_model, alone
+) -> Contact:
     pairs = overflow = None
     if g.choice is None:
         selected = everything(g, gp)
@@ -280,16 +294,83 @@ def _group(g: Group, gp: GroupParams, p: Params, world: World, number: int, reac
             margin = selected.numbers.law.margin
         return manifold(g, selected, world, margin, one)
 
+    places = pairs
+    if alone and fastest is not None and g.choice is None:
+        selected, reaches = _near_ones(g, selected, reaches, narrow(selected, world, reaches, p.one))
+        places = selected.places
+    if selected.count is not None:
+        return _in_blocks_of(g, p, world, number, selected, reaches, narrow, pairs, places, overflow)
     m = piece(narrow)(selected, world, reaches, p.one)
     if g.choice is not None:  # the solver gathers from the rows: not the narrow phase again for each of them
         m = m._with(**materialise(dict(normal=m.normal, point=m.point, distance=m.distance), p.one))
     if g.padding is not None:
         m = m._with(live=m.live & ~g.padding[:, None])
     rows = piece(lambda *args: rows_of(g, *args))(selected, m, world)
-    last = _last(g, world, number, pairs, rows.feature)
-    again = m.live & (last.n > 0)  # negative: an impact
-    warm = jax.tree.map(lambda c: jnp.where(again, c, 0.0), last)
+    last, warm = _kept(m, _last(g, world, number, pairs, rows.feature))
     return Contact(m, rows, last, warm, pairs, overflow, selected.numbers)
+
+
+def _kept(m: Manifold, last: Impulses) -> tuple[Impulses, Impulses]:
+    """Impulses of the last step, and those of them to start from."""
+    again = m.live & (last.n > 0)  # negative: an impact
+    return last, jax.tree.map(lambda c: jnp.where(again, c, 0.0), last)
+
+
+# --- one world in a program of loops: what does not touch costs nothing ---
+
+
+def _near_ones(g: Group, everything: Selected, reaches, m: Manifold) -> tuple[Selected, list[jax.Array]]:
+    """The pairs of a group that looks at all its pairs which have a live slot, in their order, and their reaches."""
+    live = m.live.any(axis=(0, 2))
+    if g.padding is not None:
+        live = live & ~g.padding
+    near = listed(live)
+    places = near.order[:, None]
+    filled = jnp.arange(len(places))[:, None] < near.count
+    selected = pick(everything, places)._with(filled=filled, count=near.count)
+    return selected, [c if c.shape[0] == 1 else at(c, places) for c in reaches]
+
+
+def _in_blocks_of(g, p, world, number, selected: Selected, reaches, narrow, pairs, places, overflow) -> Contact:
+    """A contact of the pairs ``selected``, of which the first ``count`` are filled."""
+    count = selected.count
+    before = places if pairs is None else lookup_of_one(pairs, world.pairs[number], count)
+
+    def block(selected, reaches, before):
+        m = narrow(selected, world, reaches, p.one)
+        m = m._with(**materialise(dict(normal=m.normal, point=m.point, distance=m.distance), p.one))
+        rows = rows_of(g, selected, m, world)
+        last = _found(g, world, number, before, rows.feature)
+        return m, rows, *_kept(m, last), selected.numbers
+
+    args = selected._with(count=None), reaches, before
+    m, rows, last, warm, numbers = in_blocks(block, count, *args, width=_width(g))
+    return Contact(m, rows._with(filled=count), last, warm, pairs, overflow, numbers, places if pairs is None else None)
+
+
+def _width(g: Group) -> int:
+    """Pairs of a block: fewer where each costs more."""
+    return 1 if g.kind == ("box", "box") else max(BLOCK // g.slots, 1)
+
+
+def of_places(contact: Contact, x):
+    """Of an array (P, B) over all pairs of a group what belongs to the rows of ``contact``."""
+    return x if contact.places is None else at(x, contact.places)
+
+
+def put_back(contact: Contact, tree, world_tree):
+    """Arrays (..., C, 1) of a contact in the order of its group, (..., P, 1), zero where it has none."""
+    if contact.places is None:
+        return tree
+    axis = lambda c: c.ndim - 2
+
+    def one(k, out):
+        at = contact.places[k, 0]
+        value = lambda c: jax.lax.dynamic_slice_in_dim(c, k, 1, axis(c), allow_negative_indices=False)
+        put = lambda c, v: jax.lax.dynamic_update_slice_in_dim(c, v, at, axis(c), allow_negative_indices=False)
+        return jax.tree.map(lambda c, v: put(c, value(v)), out, tree)
+
+    return repeat(0, contact.rows.filled, one, jax.tree.map(jnp.zeros_like, world_tree))
 
 
 def _ways(g: Group, selected: Selected, p: Params, world: World, fastest) -> list[jax.Array]:
@@ -378,7 +459,9 @@ def _choose(g: Group, gp: GroupParams, p: Params, world: World, reach):
     a = bounds("a", c.body_a, gp.local_a, gp.size_a)
     b = a if c.same else bounds("b", c.body_b, gp.local_b, gp.size_b)
     worlds = world.bodies.x.x.shape[-1]
-    if c.candidates is None:
+    if c.candidates is None and in_one_function() and worlds == 1:
+        keys, overflow = pairs_of_one(a, b, balls, c.allowed, g.capacity)
+    elif c.candidates is None:
         keys, overflow = all_pairs(a, b, balls, c.allowed, g.capacity)
     else:
         keys, overflow = grid_pairs(a, None if c.same else b, balls, c.allowed, g.capacity, c.candidates)
@@ -387,10 +470,15 @@ def _choose(g: Group, gp: GroupParams, p: Params, world: World, reach):
 
 def _last(g: Group, world: World, number: int, pairs, feature) -> Impulses:
     """Impulses of the last step for the same pair and the same features, zero elsewhere."""
+    place = None if pairs is None else lookup(pairs, world.pairs[number])
+    return _found(g, world, number, place, feature)
+
+
+def _found(g: Group, world: World, number: int, place, feature) -> Impulses:
+    """``_last`` of the pairs at ``place`` of the arrays of the last step; None: of all in their order."""
     last = world.contacts[number]
-    if pairs is not None:
-        place = lookup(pairs, world.pairs[number])
-        known = place < pairs.shape[0]
+    if place is not None:
+        known = place < last.n.shape[1]
         safe = jnp.where(known, place, 0)
         last = jax.tree.map(lambda c: jnp.where(known[None], jnp.take_along_axis(c, safe[None], axis=1), 0.0), last)
         if feature is not None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jax.interpreters.partial_eval import dce_jaxpr
 
 from .struct import struct
 
@@ -48,18 +49,18 @@ class Listed:
     count: jax.Array
 
 
-def listed(matters) -> Listed:
-    """The rows of ``matters`` (N,) that are true."""
+def listed(matters, among: jax.Array | None = None) -> Listed:
+    """The rows of ``matters`` (N,) that are true; ``among``: looking at so many of them."""
+    matters = matters.astype(jnp.int32)
 
-    def put(carry, x):
+    def put(number, carry):
         order, count = carry
-        number, counts = x
-        return (jax.lax.dynamic_update_slice(order, number[None], (count,)), count + counts), None
+        # a number is written where the next one goes; it stays only if it counts
+        order = jax.lax.dynamic_update_slice(order, number[None], (count,))
+        return order, count + jax.lax.dynamic_index_in_dim(matters, number, keepdims=False)
 
-    total = len(matters)
-    # a number is written where the next one goes; it stays only if it counts
-    start = (jnp.zeros(total, jnp.int32), jnp.int32(0))
-    return Listed(*jax.lax.scan(put, start, (jnp.arange(total, dtype=jnp.int32), matters.astype(jnp.int32)))[0])
+    start = (jnp.zeros(len(matters), jnp.int32), jnp.int32(0))
+    return Listed(*repeat(0, len(matters) if among is None else among, put, start))
 
 
 def over(rows: Listed, body, carry):
@@ -99,3 +100,56 @@ def each_pair(f, matters, *args):
         return jax.tree.map(one, out, new)
 
     return over(rows, put, blank)
+
+
+#: Pairs of a block: as many as two or four vectors hold.
+BLOCK = 16
+
+
+def in_blocks(f, filled: jax.Array | None, *args, width: int = BLOCK):
+    """``f(*args)``, trees of arrays (..., P, B), of the first ``filled`` pairs, block by block; zero behind them.
+
+    f: of any number of pairs, each by itself. filled None: of all, at once.
+    """
+    if filled is None:
+        return f(*args)
+    pairs = max(c.shape[-2] for c in jax.tree.leaves(args))
+    width = min(width, pairs)
+    worlds = max(c.shape[-1] for c in jax.tree.leaves(args))
+
+    def wide(*args):  # what is the same for all pairs, or all worlds, too
+        return jax.tree.map(lambda c: c if jnp.ndim(c) > 1 else jnp.broadcast_to(c, (1, worlds)), f(*args))
+
+    leaves = jax.tree.leaves(args)
+    of_block = [jax.ShapeDtypeStruct((*c.shape[:-2], min(width, c.shape[-2]), c.shape[-1]), c.dtype) for c in leaves]
+    body, shape, used = _pruned(lambda *leaves: wide(*jax.tree.unflatten(jax.tree.structure(args), leaves)), of_block)
+    cut = lambda c, at: c if c.shape[-2] == 1 else jax.lax.dynamic_slice_in_dim(c, at, width, c.ndim - 2)
+    blank = lambda c: jnp.zeros((*c.shape[:-2], pairs, c.shape[-1]), c.dtype)
+
+    def put(k, out):
+        at = jnp.minimum(k * width, pairs - width)  # the last block may hold pairs of the one before it
+        new = body(*(cut(c, at) for c, u in zip(leaves, used, strict=True) if u))
+
+        def one(c, v):
+            v = jnp.broadcast_to(v, (*v.shape[:-2], width, v.shape[-1]))
+            return jax.lax.dynamic_update_slice_in_dim(c, v, at, c.ndim - 2, allow_negative_indices=False)
+
+        return [one(c, v) for c, v in zip(out, new, strict=True)]
+
+    out = [blank(c) for c in jax.tree.leaves(shape)]
+    return jax.tree.unflatten(jax.tree.structure(shape), repeat(0, (filled + width - 1) // width, put, out))
+
+
+def _pruned(f, examples: list):
+    """``f`` as a function of those arrays that it uses, which gives a list; the shape of what f gives, which are used.
+
+    JAX takes all that the body of a loop closes over into the loop, and XLA's emitter of functions aborts where what
+    reaches one is found to be of no use there.
+    """
+    closed, shape = jax.make_jaxpr(f, return_shape=True)(*examples)
+    count = len(closed.consts)
+    inputs = [jax.ShapeDtypeStruct(jnp.shape(c), jnp.result_type(c)) for c in closed.consts]
+    whole = jax.make_jaxpr(lambda *c: jax.core.eval_jaxpr(closed.jaxpr, c[:count], *c[count:]))(*inputs, *examples)
+    jaxpr, used = dce_jaxpr(whole.jaxpr, [True] * len(whole.jaxpr.outvars))
+    consts = [c for c, u in zip(closed.consts, used) if u]
+    return lambda *leaves: jax.core.eval_jaxpr(jaxpr, whole.consts, *consts, *leaves), shape, used[count:]

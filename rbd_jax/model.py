@@ -110,6 +110,11 @@ class Structure:
             repr(sorted((k, _plain(v)) for k, v in fields.items() if k != "names")).encode()
         ).digest()
 
+    @property
+    def chooses(self) -> bool:
+        """Whether a group chooses its pairs at run time by looking at all of them."""
+        return any(g.choice is not None and g.choice.candidates is None for g in self.groups)
+
     def __hash__(self):
         return hash(self._digest)
 

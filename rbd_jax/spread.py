@@ -18,11 +18,13 @@ import numpy as np
 
 from .model import Model
 from .state import State, Wrench
-from .tiles import LANES, filled, flattened, padded, per_world, tiled
+from .tiles import LANES, alone, filled, flattened, padded, per_world, tiled
 from .xla import on_cpu, waits
 
 #: Steps of worlds of a call for which threads are worth their start (0.2 ms).
 LEAST = 20_000
+#: The same for worlds that are tiles of their own, which are larger.
+LEAST_ALONE = 200
 
 AXIS = "worlds"
 
@@ -86,7 +88,8 @@ def _waits(core, args, batch, use: Means) -> bool:
 
 
 def _allowed(args, worlds: int, steps: int) -> Means:
-    if worlds <= LANES or worlds * steps < LEAST or jax.config.jax_disable_jit:
+    few, least = (1, LEAST_ALONE) if alone(args[0]) else (LANES, LEAST)
+    if worlds <= few or worlds * steps < least or jax.config.jax_disable_jit:
         return Means()
     leaves = jax.tree.leaves(args)
     if any(isinstance(c, jax.core.Tracer) for c in leaves):

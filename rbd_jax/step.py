@@ -17,13 +17,13 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
 from .bodies import Bodies
-from .detect import chosen, detect, everything
+from .detect import chosen, detect, everything, of_places, put_back
 from .events import advance_to_impacts, carried
 from .model import Model, Params, params
 from .solvers.base import Problem, Solution
 from .solvers.restitution import normal_velocity, targets
-from .solvers.rows import Impulses, Rows, add_rows, inverse_inertia, spread, take, take_tree
-from .spatial import Quat, Vec3, components, where, zeros_like
+from .solvers.rows import Impulses, Rows, add_rows, add_trees, by_pair, inverse_inertia, spread, take, take_tree
+from .spatial import Quat, Vec3, where, zeros_like
 from .state import Memory, State, World, Wrench, to_hot, to_public
 from .status import Status
 from .struct import struct
@@ -421,7 +421,7 @@ def _solved(model: Model, p: Params, world: World, wrench: Wrench | None):
     if nominal is not None:  # impulses are kept as those of a whole step
         rest = lambda c, meets: c._with(
             warm=jax.tree.map(lambda x: x * (p.h / nominal), c.warm),
-            rows=c.rows if c.rows.e is None or c.pairs is not None else c.rows._with(meets=meets),
+            rows=c.rows if c.rows.e is None or c.pairs is not None else c.rows._with(meets=of_places(c, meets)),
         )
         contacts = tuple(rest(c, meets) for c, meets in zip(contacts, more))
     predict = lambda *args: _predicted(integrator, *args)
@@ -532,16 +532,19 @@ def _remember(world: World, bodies: Bodies, p: Params, contacts, solution: Solut
         status = status | jnp.where(solution.unconverged, jnp.uint32(int(Status.NOT_CONVERGED)), jnp.uint32(0))
     lasting = solution.contacts
     if solution.warm:
-        lasting = tuple(_marked(c.rows, lam, problem) for c, lam in zip(contacts, lasting))
+        mark = lambda rows, lam: _marked(rows, lam, problem)
+        lasting = tuple(by_pair(mark, c.rows, lam) for c, lam in zip(contacts, lasting))
     if problem.nominal is not None:
         whole = lambda lam: jax.tree.map(lambda c: c * jnp.where(lam.n < 0, 1.0, problem.nominal / problem.h), lam)
         lasting = tuple(whole(lam) for lam in lasting)
+    lasting = tuple(put_back(c, lam, old) for c, lam, old in zip(contacts, lasting, world.contacts))
+    features = [w if w is None else put_back(c, c.rows.feature, w) for c, w in zip(contacts, world.feature)]
     shape = lambda new, old: jax.tree.map(lambda a, b: jnp.broadcast_to(a, b.shape).astype(b.dtype), new, old)
     return world._with(
         bodies=bodies,
         kinematic=carried(world.kinematic, p.h),
         contacts=tuple(shape(c, w) for c, w in zip(lasting, world.contacts)),
-        feature=tuple(None if w is None else shape(c.rows.feature, w) for c, w in zip(contacts, world.feature)),
+        feature=tuple(None if w is None else shape(f, w) for f, w in zip(features, world.feature)),
         pairs=tuple(c.pairs for c in contacts),
         status=status,
     )
@@ -641,26 +644,38 @@ def _impacts(p: Params, problem: Problem, solution: Solution, v1: Vec3) -> _Impa
         if rows.e is None:
             left.append(lam)
             continue
-        events = targets(rows, problem)
-        hit, at = events.active, problem.h - events.left
-        mine = jax.tree.map(lambda c: jnp.where(hit, c, 0.0), lam)
-        left.append(jax.tree.map(lambda c: jnp.where(hit, 0.0, c), lam))
-        J = rows.n * mine.n
-        if mine.t1 is not None:
-            t1, t2 = rows.tangents
-            J = J + t1 * mine.t1 + t2 * mine.t2
-        slots = lambda v: v.map(summed)
-        impulse = spread(impulse, rows, slots(J))
-        late = slots(J * at)
+        rest, J, late, *turns, couple = by_pair(lambda *args: _impacts_of(problem, v1, *args), rows, lam)
+        left.append(rest)
+        impulse = spread(impulse, rows, J)
         shift = spread(shift, rows, late * -1.0)
         if not spin:
             continue
-        both = lambda total, b, a: _spread_sides(total, rows, b, a)
-        turn = both(turn, slots(rows.rb.cross(J) * at), None if rows.a is None else slots(rows.ra.cross(J) * at))
+        turn = _spread_sides(turn, rows, *turns)
         if rows.a is not None:
-            couple = late.cross(take_tree(v1, rows.b) - take_tree(v1, rows.a)) * 0.5
-            balance = both(balance, couple, couple * -1.0)
+            balance = _spread_sides(balance, rows, couple, couple * -1.0)
     return _Impacts(impulse, shift * p.inv_mass, turn, balance, tuple(left))
+
+
+def _impacts_of(problem: Problem, v1: Vec3, rows: Rows, lam: Impulses):
+    """Of every pair: the impulses that are no impact, J and J t of those that are, the turns t r x J of B and A,
+    and the couple that balances them."""
+    events = targets(rows, problem)
+    hit, at = events.active, problem.h - events.left
+    mine = jax.tree.map(lambda c: jnp.where(hit, c, 0.0), lam)
+    rest = jax.tree.map(lambda c: jnp.where(hit, 0.0, c), lam)
+    J = rows.n * mine.n
+    if mine.t1 is not None:
+        t1, t2 = rows.tangents
+        J = J + t1 * mine.t1 + t2 * mine.t2
+    slots = lambda v: v.map(summed)
+    late = slots(J * at)
+    if problem.w is None:
+        return rest, slots(J), late, None, None, None
+    turn = slots(rows.rb.cross(J) * at)
+    if rows.a is None:
+        return rest, slots(J), late, turn, None, None
+    couple = late.cross(take_tree(v1, rows.b) - take_tree(v1, rows.a)) * 0.5
+    return rest, slots(J), late, turn, slots(rows.ra.cross(J) * at), couple
 
 
 def _passive(p: Params, problem: Problem, solution: Solution) -> Solution:
@@ -727,7 +742,5 @@ def _power(rows: Rows, lam: Impulses, v: Vec3, w: Vec3 | None, accel: Vec3, left
 
 def _spread_sides(total: Vec3, rows, b: Vec3, a: Vec3 | None) -> Vec3:
     """``total`` with ``b`` added to body B and ``a`` subtracted from body A."""
-    total = Vec3(*(add_rows(t, rows.b, v) for t, v in zip(components(total), components(b))))
-    if a is None:
-        return total
-    return Vec3(*(add_rows(t, rows.a, -v) for t, v in zip(components(total), components(a))))
+    total = add_trees(total, rows.b, b, rows.filled)
+    return total if a is None else add_trees(total, rows.a, a * -1.0, rows.filled)

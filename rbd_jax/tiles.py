@@ -7,8 +7,11 @@ Instead a batch is cut into tiles of a few hundred worlds, each of which runs al
 * as one function, where all operations are of a kind that XLA can compile so (``single``),
 * on one core, while the other cores run other tiles (``spread``).
 
-Every tile is ``LANES`` wide or a multiple of it, the last one filled up with copies of a world: the arithmetic of a
-world does not depend on how many there are, or on which core runs it.
+A world that chooses its pairs by itself is a tile of its own (``alone``): of many bodies few touch, in each world
+others, and a loop over those of one world takes less time than arithmetic on all that touch in one of many.
+
+Every other tile is ``LANES`` wide or a multiple of it, the last one filled up with copies of a world: the arithmetic of
+a world does not depend on how many there are, or on which core runs it.
 """
 
 from __future__ import annotations
@@ -39,8 +42,15 @@ def single(core, worlds: int):
 # --- tiles ---
 
 
-def width_of(worlds: int, parts: int = 1) -> tuple[int, int]:
+def alone(model: Model) -> bool:
+    """Whether every world is a tile of its own: a group chooses its pairs by looking at all, for sweeps over them."""
+    return model.method.solver.coloured and model.structure.chooses
+
+
+def width_of(worlds: int, parts: int = 1, alone: bool = False) -> tuple[int, int]:
     """(tiles, worlds of a tile) for a batch over ``parts`` cores: tiles is a multiple of parts, or less than it."""
+    if alone:
+        return -(-worlds // parts) * parts, 1
     tiles = -(-worlds // TILE)
     if worlds > LANES:
         tiles = -(-tiles // parts) * parts
@@ -87,7 +97,7 @@ def tiled(core, model: Model, state: State, wrench: Wrench | None, batch: tuple[
     worlds = math.prod(batch)
     if not on_cpu():
         return core(model, state, wrench)
-    tiles, width = width_of(worlds, parts)
+    tiles, width = width_of(worlds, parts, alone(model))
     if tiles * width == worlds and tiles == 1 and parts == 1:
         return single(core, width)(model, state, wrench)
     args = flattened(model, state, wrench, batch)

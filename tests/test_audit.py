@@ -258,7 +258,8 @@ def test_a_frozen_world_made_no_step():
 def test_pairs_chosen_at_run_time(monkeypatch):
     import sys
 
-    monkeypatch.setattr(sys.modules["rbd_jax.build"], "DENSE_PAIRS", {("sphere", "sphere"): 0})
+    for name in ("DENSE_PAIRS", "COLOURED_PAIRS"):
+        monkeypatch.setattr(sys.modules["rbd_jax.build"], name, {("sphere", "sphere"): 0})
     _, _, _, seen = audited(scenes.two_spheres(restitution=1.0), "fast", 120)
     assert (seen.points > 0).any()
     lost = total(seen, "dissipated")

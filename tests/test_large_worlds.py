@@ -22,6 +22,7 @@ def choosing(monkeypatch, scene, method=TGS):
     """The scene with all its groups choosing their pairs at run time."""
     with monkeypatch.context() as m:
         m.setattr(builder, "DENSE_PAIRS", EVERY_KIND)
+        m.setattr(builder, "COLOURED_PAIRS", EVERY_KIND)
         return rbd.build(scene, method=method)
 
 

@@ -5,6 +5,7 @@ surfaces), grown by the way the bodies move in a step, come together, in at most
 one pair more sets the CAPACITY status bit of that world. Two ways to find them:
 
 * ``all_pairs`` compares everything with everything, 32 pairs to a word: about 1 ns a pair and world.
+* ``pairs_of_one`` does the same for one world in a program that is one function: it walks through the set bits.
 * ``grid_pairs`` sorts the geoms into the cells of a uniform grid as wide as the largest box. The cells of a column are
   neighbours in that order, so the neighbours of a geom are a few ranges, found by bisection; all ranges together
   are laid out in ``candidates`` places. No cell has a capacity of its own; more candidates set the bit.
@@ -24,6 +25,7 @@ import numpy as np
 
 from ..spatial import Vec3
 from ..struct import struct
+from ..xla import summed
 from .base import Pose
 
 #: Gap, as a part of the smaller geom's size, up to which its points count as contact.
@@ -135,7 +137,43 @@ def lookup(pairs: jax.Array, previous: jax.Array) -> jax.Array:
     return jnp.where(at(previous, place) == pairs, place, previous.shape[0])
 
 
+def lookup_of_one(pairs: jax.Array, previous: jax.Array, filled: jax.Array) -> jax.Array:
+    """As ``lookup``, of one world and for a program that is one function: both lists are gone through once.
+
+    filled: how many pairs there are; the rest are empty places.
+    """
+    count = len(pairs)
+
+    def step(carry):
+        i, j, place = carry
+        new, old = pairs[i, 0], previous[jnp.minimum(j, count - 1), 0]
+        behind = (j < count) & (old < new)
+        found = jnp.where((j < count) & (old == new), j, count)[None, None]
+        # what is written too early is written again
+        place = jax.lax.dynamic_update_slice(place, found, (i, jnp.int32(0)))
+        return jnp.where(behind, i, i + 1), jnp.where(behind, j + 1, j), place
+
+    start = (jnp.int32(0), jnp.int32(0), jnp.full(pairs.shape, count, jnp.int32))
+    return jax.lax.while_loop(lambda c: c[0] < filled, step, start)[2]
+
+
 # --- the two searches ---
+
+
+def _words(a: Bounds, b: Bounds, balls: bool, allowed: np.ndarray | None) -> jax.Array:
+    """uint32 (count_a / 32, count_b, B): 32 geoms of side A to a word, a bit where the pair is close."""
+    count_a, count_b = len(a), len(b)
+    worlds = max(c.shape[1] for c in jax.tree.leaves((a, b)))
+    pad = -count_a % WORD
+    words = -(-count_a // WORD)
+    # bits along the slow axis: the fast ones (geoms of B, worlds) are vectors; what is padded is infinitely far
+    fit = lambda c: jnp.pad(c, ((0, pad), (0, 0)), constant_values=jnp.inf).reshape(words, WORD, 1, c.shape[1])
+    a = Bounds(a.x.map(fit), a.half.map(lambda c: jnp.pad(c, ((0, pad), (0, 0))).reshape(words, WORD, 1, c.shape[1])))
+    b = jax.tree.map(lambda c: c[None, None], b)
+    found = jnp.broadcast_to(close(a, b, balls), (words, WORD, count_b, worlds))
+    weight = (np.uint32(1) << np.arange(WORD, dtype=np.uint32))[None, :, None, None]
+    word = summed(jnp.where(found, weight, jnp.uint32(0)), axis=1).astype(jnp.uint32)
+    return word if allowed is None else word & jnp.asarray(allowed)[:, :, None]
 
 
 def all_pairs(a: Bounds, b: Bounds, balls: bool, allowed: np.ndarray | None, capacity: int):
@@ -149,19 +187,9 @@ def all_pairs(a: Bounds, b: Bounds, balls: bool, allowed: np.ndarray | None, cap
     Returns:
       keys: int32 (C, B), ``no_key`` where a place is empty. overflow: bool (B,), there are more than C.
     """
-    count_a, count_b = len(a), len(b)
-    worlds = max(c.shape[1] for c in jax.tree.leaves((a, b)))
-    pad = -count_a % WORD
-    words = -(-count_a // WORD)
-    # bits along the slow axis: the fast ones (geoms of B, worlds) are vectors; what is padded is infinitely far
-    fit = lambda c: jnp.pad(c, ((0, pad), (0, 0)), constant_values=jnp.inf).reshape(words, WORD, 1, c.shape[1])
-    a = Bounds(a.x.map(fit), a.half.map(lambda c: jnp.pad(c, ((0, pad), (0, 0))).reshape(words, WORD, 1, c.shape[1])))
-    b = jax.tree.map(lambda c: c[None, None], b)
-    found = jnp.broadcast_to(close(a, b, balls), (words, WORD, count_b, worlds))
-    weight = (np.uint32(1) << np.arange(WORD, dtype=np.uint32))[None, :, None, None]
-    word = jnp.where(found, weight, jnp.uint32(0)).sum(axis=1, dtype=jnp.uint32)
-    if allowed is not None:
-        word = word & jnp.asarray(allowed)[:, :, None]
+    word = _words(a, b, balls, allowed)
+    words, count_b, worlds = word.shape
+    count_a = len(a)
     word = word.reshape(words * count_b, worlds)
     number = jax.lax.population_count(word).astype(jnp.int32)
     ends = jnp.cumsum(number, axis=0)
@@ -169,6 +197,28 @@ def all_pairs(a: Bounds, b: Bounds, balls: bool, allowed: np.ndarray | None, cap
     home = below(ends, place, inclusive=True)
     key = home * WORD + nth_bit(at(word, home), place - at(ends - number, home))
     return jnp.where(place < ends[-1], key, no_key(count_a, count_b)), ends[-1] > capacity
+
+
+def pairs_of_one(a: Bounds, b: Bounds, balls: bool, allowed: np.ndarray | None, capacity: int):
+    """As ``all_pairs``, of one world and for a program that is one function of the CPU (``xla.one_function``)."""
+    word = _words(a, b, balls, allowed)[..., 0].ravel()
+    none = no_key(len(a), len(b))
+
+    def step(carry):
+        k, left, count, keys = carry
+        bit = jax.lax.population_count((left & (~left + 1)) - 1).astype(jnp.int32)
+        key = jnp.where(left == 0, none, k * WORD + bit)[None, None]
+        # written where the next one goes; it stays only if there was a bit
+        keys = jax.lax.dynamic_update_slice(keys, key, (jnp.minimum(count, capacity), jnp.int32(0)))
+        count = count + (left != 0)
+        left = left & (left - 1)
+        on = left == 0
+        k = k + on
+        return k, jnp.where(on, word[jnp.minimum(k, len(word) - 1)], left), count, keys
+
+    start = (jnp.int32(0), word[0], jnp.int32(0), jnp.full((capacity + 1, 1), none, jnp.int32))
+    _, _, count, keys = jax.lax.while_loop(lambda c: c[0] < len(word), step, start)
+    return keys[:capacity], count[None] > capacity
 
 
 def grid_pairs(a: Bounds, b: Bounds | None, balls: bool, allowed: np.ndarray | None, capacity: int, candidates: int):

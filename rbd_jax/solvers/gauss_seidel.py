@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..loops import Listed, listed, only_if, repeat
+from ..loops import Listed, in_blocks, listed, only_if, repeat
 from ..spatial import Vec3
 from ..struct import struct
 from ..xla import in_one_function, loops_are_cheap, materialise, piece, summed
@@ -22,7 +22,7 @@ from .base import Problem, Solution
 from .colouring import Plan, plan
 from .laws import Law
 from .restitution import Events, normal_velocity, targets
-from .rows import Impulses, Index, Rows, add_rows, take, take_tree
+from .rows import Impulses, Index, Rows, add_trees, take, take_tree
 
 #: Groups with more rows than this (slots x colours) loop over their slots instead of unrolling them.
 UNROLL = 4
@@ -142,10 +142,23 @@ def _planned(rows: Rows, problem: Problem) -> tuple[Rows, Plan]:
 
 
 def prepare(rows: Rows, problem: Problem) -> Group:
-    one = problem.one
     chunks = None
-    if not isinstance(rows.b, Index):
+    fixed = isinstance(rows.b, Index)
+    by_point = in_one_function() and (fixed or rows.b.shape[1] == 1)
+    if not fixed and not by_point:
         rows, chunks = _planned(rows, problem)
+    if not by_point or rows.filled is None:
+        return _prepared(rows, problem, chunks)._with(points=_listed_points(rows) if by_point else None)
+    filled, bare = rows.filled, rows._with(filled=None)
+    if fixed:
+        raise TypeError("rows of one world that are filled in part name their bodies in an array")
+    g = in_blocks(lambda rows: _prepared(rows, problem, None), filled, bare)
+    return g._with(rows=g.rows._with(filled=filled), points=_listed_points(rows))
+
+
+def _prepared(rows: Rows, problem: Problem, chunks: Plan | None) -> Group:
+    """``prepare`` of pairs in the order in which they are solved, each by itself; without the list of points."""
+    one = problem.one
     rows = rows._with(
         rb=materialise(rows.rb, one),
         ra=materialise(rows.ra, one),
@@ -160,7 +173,7 @@ def prepare(rows: Rows, problem: Problem) -> Group:
             sides.append((None, None))
         else:
             sides.append((take(problem.inv_mass, index), problem.inv_inertia.take(index) if spin else None))
-    if chunks is not None:  # gathers are cheap, but not in every kernel that uses them
+    if not isinstance(rows.b, Index):  # gathers are cheap, but not in every kernel that uses them
         sides, t1, t2 = materialise((sides, t1, t2), one)
     (mb, ib), (ma, ia) = sides
 
@@ -196,8 +209,24 @@ def prepare(rows: Rows, problem: Problem) -> Group:
         events=materialise_events(targets(rows, problem), one) if rows.e is not None else None,
         plan=chunks,
         couples=None if rows.mu_spin is None else _couples(rows, t1, t2, ib, ia),
-        points=listed(rows.live.any(axis=-1).T.ravel()) if in_one_function() and isinstance(rows.b, Index) else None,
     )
+
+
+def each(f, groups, *more) -> tuple:
+    """``f(group, ...)`` of every group, arrays over its pairs; of one that is filled in part in blocks."""
+    out = []
+    for g, *args in zip(groups, *more):
+        if g.rows.filled is None:
+            out.append(f(g, *args))
+            continue
+        bare = g._with(rows=g.rows._with(filled=None), points=None)
+        out.append(in_blocks(f, g.rows.filled, bare, *args))
+    return tuple(out)
+
+
+def _listed_points(rows: Rows) -> Listed:
+    among = None if rows.filled is None else rows.filled * rows.slots
+    return listed(rows.live.any(axis=-1).T.ravel(), among)
 
 
 def _couples(rows: Rows, t1: Vec3, t2: Vec3, ib, ia) -> Couples:
@@ -215,7 +244,19 @@ def materialise_events(events: Events, one) -> Events:
 
 def apply(g: Group, lam: Impulses, body):
     """Velocities after the impulses ``lam`` of one group (warm start)."""
-    v, w = body
+    rows, spin = g.rows, body[1] is not None
+    (changes,) = each(lambda g, lam: _changes(g, lam, spin), (g,), (lam,))
+    ends = (rows.b, rows.a)
+    for index, change in zip(ends, changes):
+        moved = add_trees(
+            [c for c, d in zip(body, change) if d is not None], index, [d for d in change if d is not None], rows.filled
+        )
+        body = (*moved, *body[len(moved) :])
+    return body
+
+
+def _changes(g: Group, lam: Impulses, spin: bool) -> list:
+    """(change of velocity, change of spin or None) of body B and, where there is one, A of every pair."""
     rows = g.rows
     # of many pairs of one world XLA's own sum over a slow axis takes 10 times as long as the additions
     slots = lambda c: summed(c) if g.plan is None else sum(c[1:], c[0])
@@ -224,22 +265,17 @@ def apply(g: Group, lam: Impulses, body):
         p = p + g.t1 * lam.t1 + g.t2 * lam.t2
     total = p.map(slots)
 
-    def side(v, w, index, inv_mass, inertia, arm, sign):
-        v = Vec3(
-            *(add_rows(c, index, sign * inv_mass * d) for c, d in zip((v.x, v.y, v.z), (total.x, total.y, total.z)))
-        )
-        if w is not None and not (rows.mu is None and (rows.central_b if sign > 0 else rows.central_a)):
+    def side(inv_mass, inertia, arm, sign):
+        w = None
+        if spin and not (rows.mu is None and (rows.central_b if sign > 0 else rows.central_a)):
             turn = arm.cross(p).map(slots)
             if lam.s is not None:
                 turn = turn + _couple(g, lam).map(slots)
-            turn = inertia @ turn
-            w = Vec3(*(add_rows(c, index, sign * d) for c, d in zip((w.x, w.y, w.z), (turn.x, turn.y, turn.z))))
-        return v, w
+            w = (inertia @ turn) * sign
+        return total * (sign * inv_mass), w
 
-    v, w = side(v, w, rows.b, g.inv_mass_b, g.inertia_b, rows.rb, 1.0)
-    if rows.a is not None:
-        v, w = side(v, w, rows.a, g.inv_mass_a, g.inertia_a, rows.ra, -1.0)
-    return v, w
+    out = [side(g.inv_mass_b, g.inertia_b, rows.rb, 1.0)]
+    return out if rows.a is None else [*out, side(g.inv_mass_a, g.inertia_a, rows.ra, -1.0)]
 
 
 def _couple(g: Group, lam: Impulses) -> Vec3:
@@ -317,10 +353,10 @@ def sweep(g: Group, law: Sweep, lam: Impulses, body, one):
     """One Gauss-Seidel sweep over a group: colours one after the other, slots one after the other."""
     rows = g.rows
     pairs = rows.phi.shape[1]
-    if not isinstance(rows.b, Index):
-        return _sweep_chunks(g, law, lam, body, one)
     if g.points is not None:
         return _sweep_points(g, law, lam, body, one)
+    if not isinstance(rows.b, Index):
+        return _sweep_chunks(g, law, lam, body, one)
     colours = rows.colours or ((0, pairs),)
     whole = len(colours) == 1
     if loops(rows.slots, len(colours)):
@@ -388,13 +424,13 @@ def _sweep_colours(g: Group, law: Sweep, lam: Impulses, body, one):
 def _sweep_points(g: Group, law: Sweep, lam: Impulses, body, one):
     """As ``sweep``, point after point, without those that are dead in every world.
 
-    The pairs are in the order of their colours, so the result is that of ``_sweep_colours``.
+    The pairs are in the order of their colours, so the result is that of ``_sweep_colours``. Those that a world chose
+    for itself are in the order of their keys; there is one world then.
     """
     rows = g.rows
     slots, pairs, worlds = rows.phi.shape
     at = lambda c, k, axis: jax.lax.dynamic_slice_in_dim(c, k if c.shape[axis] > 1 else 0, 1, axis)
-    row_b = jnp.asarray(rows.b.rows)
-    row_a = None if rows.a is None else jnp.asarray(rows.a.rows)
+    row_b, row_a = (_bodies(i) for i in (rows.b, rows.a))
 
     def of_pair(tree, pair):
         return jax.tree.map(lambda c: c if jnp.ndim(c) < 2 else at(c, pair, 0), tree)
@@ -408,11 +444,10 @@ def _sweep_points(g: Group, law: Sweep, lam: Impulses, body, one):
         number = g.points.order[k]
         pair, slot = number // slots, number % slots
         ends = [r[pair] for r in (row_b, row_a) if r is not None]
-        # read once: what is read later, in the kernels that use it, would have to be copied before it is written
-        old = of_point(lam, pair, slot)
         local = [jax.tree.map(lambda c: at(c, end, 0), body) for end in ends]
+        own, old = of_point(_of_points(g, law), pair, slot), of_point(lam, pair, slot)
+        # read once: what is read later, in the kernels that use it, would have to be copied before it is written
         old, local = materialise((old, local), one)
-        own = of_point(_of_points(g, law), pair, slot)
         new, l = _point(_pair(rows, *of_pair(_of_pairs(g), pair)), (*own, old), (*local, None)[:2], one)
         for end, values in zip(ends, new):
             body = jax.tree.map(lambda c, v: jax.lax.dynamic_update_slice_in_dim(c, v, end, axis=0), body, values)
@@ -423,6 +458,13 @@ def _sweep_points(g: Group, law: Sweep, lam: Impulses, body, one):
     body = jax.tree.map(lambda c: jnp.broadcast_to(c, (c.shape[0], worlds)), body)
     _, body, lam = jax.lax.while_loop(lambda c: c[0] < g.points.count, point, (jnp.int32(0), body, lam))
     return body, lam
+
+
+def _bodies(index) -> jax.Array | None:
+    """The bodies of all pairs, (P,), the same in every world."""
+    if index is None:
+        return None
+    return jnp.asarray(index.rows) if isinstance(index, Index) else index[:, 0]
 
 
 def _of_pairs(g: Group):
@@ -450,6 +492,7 @@ def _pair(rows: Rows, n, mu, t1, t2, inv_mass_b, inv_mass_a, inertia_b, inertia_
         mu_spin=None,
         mu_roll=None,
         surface_spin=None,
+        filled=None,
         feature=None,
         law=None,
         meets=None,

@@ -13,7 +13,7 @@ import dataclasses
 
 from ..xla import part
 from .base import Problem, Solution, Solver
-from .gauss_seidel import biased, solution, started, sweeps
+from .gauss_seidel import biased, each, solution, started, sweeps
 from .laws import contact_model
 
 
@@ -35,6 +35,6 @@ class PGS(Solver):
     def solve(self, problem: Problem) -> Solution:
         model, one = contact_model(self, problem), problem.one
         groups, warm, body = part(started)(problem)
-        laws = [biased(g, model.law(g.rows, g.k_n, problem)) for g in groups]
+        laws = each(lambda g: biased(g, model.law(g.rows, g.k_n, problem)), groups)
         body, lam = sweeps(groups, laws, warm, body, one, self.sweeps)
         return solution(problem, groups, body, lam)

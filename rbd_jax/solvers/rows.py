@@ -23,7 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..bodies import Inertia
-from ..spatial import Quat, Vec3, components, tangent_basis
+from ..loops import in_blocks, read, repeat, write
+from ..spatial import Quat, Vec3, tangent_basis
 from ..struct import static, struct
 from ..xla import in_one_function
 
@@ -64,6 +65,8 @@ class Rows:
         at its start; None = unknown.
       surface: velocity of a kinematic partner at the points [m/s], (S, P, B), None = at rest.
       surface_spin: its angular velocity [rad/s], (P, B); None = at rest, or no row that needs it.
+      filled: of pairs that one world chose in a program of loops: how many there are, int32 (); those from there on
+        are empty. None = all may hold one.
       feature: manifold code for warm starting, int32 (P, B) or (1, 1).
       law: per-pair numbers of a contact law that a solver asks for (solref, solimp, ...), or None.
       central_a, central_b: the normal passes through that body's centre of mass (a sphere whose
@@ -85,6 +88,7 @@ class Rows:
     mu_spin: jax.Array | None = None
     mu_roll: jax.Array | None = None
     surface_spin: Vec3 | None = None
+    filled: jax.Array | None = None
     feature: jax.Array | None = None
     law: object = None
     central_a: bool = static(default=False)
@@ -146,6 +150,13 @@ class InverseInertia:
         return jax.tree.map(lambda c: take(c, index), self)
 
 
+def by_pair(f, rows: Rows, *more):
+    """``f(rows, *more)``, arrays over pairs each of which is worked out by itself, without those that are empty."""
+    if rows.filled is None:
+        return f(rows, *more)
+    return in_blocks(f, rows.filled, rows._with(filled=None), *more)
+
+
 def take(x: jax.Array, index) -> jax.Array:
     """Rows of a body array (n, B or 1): (P, B or 1). No operation when the index is 0, 1, ..., n-1."""
     if isinstance(index, Index):
@@ -171,21 +182,32 @@ def add_rows(x: jax.Array, index, values: jax.Array, unique: bool = False) -> ja
         if len(rows) == x.shape[0] and np.array_equal(rows, np.arange(len(rows))):
             return x + values
         if in_one_function():
-            return _added_in_turn(x, rows, values)
+            return _added_in_turn([x], rows, [values])[0]
         return x.at[rows].add(values, unique_indices=unique)
+    if in_one_function() and x.shape[1] == 1:
+        return _added_in_turn([x], index[:, 0], [values])[0]
     return x.at[index, jnp.arange(x.shape[1])[None, :]].add(values)
 
 
-def _added_in_turn(x: jax.Array, rows: np.ndarray, values: jax.Array) -> jax.Array:
-    x = jnp.broadcast_to(x, (x.shape[0], np.broadcast_shapes(x.shape[1:], values.shape[1:])[0]))
+def add_trees(tree, index, values, filled: jax.Array | None = None):
+    """As ``add_rows`` of every array of ``tree``, in one loop where it is one. filled: pairs from here on are zero."""
+    fixed = isinstance(index, Index)
+    leaves, kind = jax.tree.flatten(tree)
+    given = kind.flatten_up_to(values)
+    in_order = fixed and len(index) == len(leaves[0]) and np.array_equal(index.rows, np.arange(len(index)))
+    if in_one_function() and not in_order and (fixed or index.shape[1] == 1):
+        rows = index.rows if fixed else index[:, 0]
+        return kind.unflatten(_added_in_turn(leaves, rows, given, filled))
+    return kind.unflatten([add_rows(x, index, v) for x, v in zip(leaves, given)])
 
-    def add(x, row_value):
-        row, value = row_value
-        old = jax.lax.dynamic_index_in_dim(x, row, axis=0)
-        return jax.lax.dynamic_update_slice_in_dim(x, old + value[None], row, axis=0), None
 
-    values = jnp.broadcast_to(values, (len(rows), values.shape[1]))
-    return jax.lax.scan(add, x, (jnp.asarray(rows), values))[0]
+def _added_in_turn(leaves: list, rows: np.ndarray | jax.Array, values: list, filled=None) -> list:
+    wide = np.broadcast_shapes(*(c.shape[1:] for c in (*leaves, *values)))
+    leaves = [jnp.broadcast_to(c, (len(c), *wide)) for c in leaves]
+    values = [jnp.broadcast_to(c, (len(rows), *wide)) for c in values]
+    rows = jnp.asarray(rows)
+    add_one = lambda k, leaves: [write(x, rows[k], read(x, rows[k]) + read(v, k)) for x, v in zip(leaves, values)]
+    return repeat(0, len(rows) if filled is None else filled, add_one, leaves)
 
 
 def inverse_inertia(inertia: Inertia, q: Quat) -> InverseInertia:
@@ -200,9 +222,5 @@ def inverse_inertia(inertia: Inertia, q: Quat) -> InverseInertia:
 
 def spread(total: Vec3, rows: Rows, values: Vec3) -> Vec3:
     """``total`` (n, B) with pair values (P, B) added to body B and subtracted from body A."""
-
-    def side(total, index, sign):
-        return Vec3(*(add_rows(t, index, sign * v) for t, v in zip(components(total), components(values))))
-
-    total = side(total, rows.b, 1.0)
-    return total if rows.a is None else side(total, rows.a, -1.0)
+    total = add_trees(total, rows.b, values, rows.filled)
+    return total if rows.a is None else add_trees(total, rows.a, values * -1.0, rows.filled)

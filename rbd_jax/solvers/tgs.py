@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from ..xla import part
 from . import single
 from .base import Problem, Solution, Solver
-from .gauss_seidel import biased, in_phases, relaxing, solution, started, sweeps
+from .gauss_seidel import biased, each, in_phases, relaxing, solution, started, sweeps
 from .laws import Law, contact_model
 from .restitution import normal_velocity, targets
 from .rows import Impulses, Rows
@@ -53,11 +53,11 @@ class TGS(Solver):
 
     def _swept(self, model, problem: Problem, groups, lam, body) -> Solution:
         one = problem.one
-        soft = tuple(biased(g, model.law(g.rows, g.k_n, problem)) for g in groups)
+        soft = each(lambda g: biased(g, model.law(g.rows, g.k_n, problem)), groups)
         if model.physical:
             body, lam = sweeps(groups, soft, lam, body, one, self.sweeps)
             return solution(problem, groups, body, lam)
-        relaxed = lambda body, lam: tuple(relaxing(g, l, body, problem.h) for g, l in zip(groups, lam))
+        relaxed = lambda body, lam: each(lambda g, lam: relaxing(g, lam, body, problem.h), groups, lam)
         body, lam, moving = in_phases(groups, soft, relaxed, lam, body, one, (self.sweeps, self.relax))
         return solution(problem, groups, body, lam, moving)
 
