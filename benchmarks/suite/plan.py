@@ -18,8 +18,8 @@ SOLVED = ("slide", "incline", "column")
 
 
 #: Longest job of ``standard`` [s].
-LIMITS = {"ours": 300.0, "mujoco": 100.0, "mjx": 100.0, "brax": 100.0}
-#: Bodies of a scene from which on an error run and a job may take longer.
+LIMITS = {"ours": 300.0, "mujoco": 100.0, "mjx": 60.0, "brax": 60.0}
+#: Bodies of a scene from which on an error run may take longer.
 LARGE = 64
 #: Made for batches, and slow to compile: one world of three bodies or more is left to ``full``.
 SLOW_ALONE = ("mjx", "brax")
@@ -88,9 +88,9 @@ def standard(case, engine) -> Job:
     if engine.name in SLOW_ALONE and len(case.parts) > 2:
         both, batches = (), (1024,)
     large = len(case.parts) >= LARGE
-    error_s = 20.0 if large else 3.0 if engine.name == "ours" else 1.5
-    limit = LIMITS.get(engine.name, 60.0) * (2 if large and engine.name not in SLOW_ALONE else 1)
-    return Job(case.name, engine.name, tuple(variants), case.steps, both, batches, error_s, limit_s=limit)
+    error_s = 10.0 if large else 3.0 if engine.name == "ours" else 1.5
+    limit_s = LIMITS.get(engine.name, 60.0)
+    return Job(case.name, engine.name, tuple(variants), case.steps, both, batches, error_s, limit_s=limit_s)
 
 
 def full(case, engine) -> Job:

@@ -27,6 +27,8 @@ EVENTS = 4
 SHORT = 2e-3
 #: A program that compiles in less [s] is made for every number of steps that is asked for.
 QUICK = 2.0
+#: A call of an error run has so many steps or more, where it can: a call of fewer costs more than they do.
+CALLED = 8
 
 
 def _method(variant: str, case: Case) -> rbd.Method:
@@ -111,8 +113,8 @@ class _Simulation(Simulation):
         with self._width():
             state = self._state(start)
             seen = [state]
-            chunk = math.gcd(steps_a_sample, *self.counts)  # two programs for all steps of the sweep
-            if steps_a_sample % (10 * chunk) == 0:
+            chunk = math.gcd(steps_a_sample, *self.counts)  # one program for all steps of the sweep, or two
+            if chunk < CALLED and steps_a_sample % (10 * chunk) == 0:
                 chunk *= 10
             if not self.model.structure.groups:
                 chunk = steps_a_sample  # quick to compile
