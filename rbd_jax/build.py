@@ -23,8 +23,10 @@ from .state import Kinematic, State
 
 #: Groups with more pairs than this choose their pairs at run time (a box pair costs far more than a ball pair).
 DENSE_PAIRS = {("box", "box"): 100, ("sphere", "box"): 600, ("sphere", "sphere"): 2100}
-#: The same for a solver that would go through their colours one by one; on a CPU it goes through those that touch.
-COLOURED_PAIRS = {("box", "box"): 100, ("sphere", "box"): 500, ("sphere", "sphere"): 50}
+#: The same for a solver that goes through pairs: of fewer, most touch in some world of a tile, and all at once are faster.
+COLOURED_PAIRS = {("box", "box"): 100, ("sphere", "box"): 500, ("sphere", "sphere"): 500}
+#: The same for such a solver where nothing pulls bodies together: few touch at a time.
+FLOATING_PAIRS = {("box", "box"): 100, ("sphere", "box"): 50, ("sphere", "sphere"): 50}
 #: From this many places on (geoms of side A times geoms of side B) the pairs are searched on a grid, if that has less.
 GRID_PAIRS = 8_000_000
 RANK = {shape.kind: i for i, shape in enumerate(SHAPES)}
@@ -283,7 +285,9 @@ def _groups(r, kinds, category, centred, method: Method, scene: Scene, dt: float
         ga, gb = a[rows], b[rows]
         body_a, body_b = r.geom_body[ga], r.geom_body[gb]
         capacity = choice = None
-        limit = (COLOURED_PAIRS if method.solver.coloured else DENSE_PAIRS).get(kind, 10**9)
+        floating = scene.gravity is None or not np.any(scene.gravity)
+        limits = DENSE_PAIRS if not method.solver.coloured else FLOATING_PAIRS if floating else COLOURED_PAIRS
+        limit = limits.get(kind, 10**9)
         if len(rows) > limit:
             choice = _choice(r, kind, a, b, rows, override, sizes, method)
             capacity = _capacity(r, kind, (a[rows], b[rows]), sizes, category, method, scene, dt)

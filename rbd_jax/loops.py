@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jax.interpreters.partial_eval import dce_jaxpr
 
 from .struct import struct
 
@@ -120,36 +119,18 @@ def in_blocks(f, filled: jax.Array | None, *args, width: int = BLOCK):
     def wide(*args):  # what is the same for all pairs, or all worlds, too
         return jax.tree.map(lambda c: c if jnp.ndim(c) > 1 else jnp.broadcast_to(c, (1, worlds)), f(*args))
 
-    leaves = jax.tree.leaves(args)
-    of_block = [jax.ShapeDtypeStruct((*c.shape[:-2], min(width, c.shape[-2]), c.shape[-1]), c.dtype) for c in leaves]
-    body, shape, used = _pruned(lambda *leaves: wide(*jax.tree.unflatten(jax.tree.structure(args), leaves)), of_block)
     cut = lambda c, at: c if c.shape[-2] == 1 else jax.lax.dynamic_slice_in_dim(c, at, width, c.ndim - 2)
     blank = lambda c: jnp.zeros((*c.shape[:-2], pairs, c.shape[-1]), c.dtype)
 
     def put(k, out):
         at = jnp.minimum(k * width, pairs - width)  # the last block may hold pairs of the one before it
-        new = body(*(cut(c, at) for c, u in zip(leaves, used, strict=True) if u))
+        new = wide(*jax.tree.map(lambda c: cut(c, at), args))
 
         def one(c, v):
             v = jnp.broadcast_to(v, (*v.shape[:-2], width, v.shape[-1]))
             return jax.lax.dynamic_update_slice_in_dim(c, v, at, c.ndim - 2, allow_negative_indices=False)
 
-        return [one(c, v) for c, v in zip(out, new, strict=True)]
+        return jax.tree.map(one, out, new)
 
-    out = [blank(c) for c in jax.tree.leaves(shape)]
-    return jax.tree.unflatten(jax.tree.structure(shape), repeat(0, (filled + width - 1) // width, put, out))
-
-
-def _pruned(f, examples: list):
-    """``f`` as a function of those arrays that it uses, which gives a list; the shape of what f gives, which are used.
-
-    JAX takes all that the body of a loop closes over into the loop, and XLA's emitter of functions aborts where what
-    reaches one is found to be of no use there.
-    """
-    closed, shape = jax.make_jaxpr(f, return_shape=True)(*examples)
-    count = len(closed.consts)
-    inputs = [jax.ShapeDtypeStruct(jnp.shape(c), jnp.result_type(c)) for c in closed.consts]
-    whole = jax.make_jaxpr(lambda *c: jax.core.eval_jaxpr(closed.jaxpr, c[:count], *c[count:]))(*inputs, *examples)
-    jaxpr, used = dce_jaxpr(whole.jaxpr, [True] * len(whole.jaxpr.outvars))
-    consts = [c for c, u in zip(closed.consts, used) if u]
-    return lambda *leaves: jax.core.eval_jaxpr(jaxpr, whole.consts, *consts, *leaves), shape, used[count:]
+    out = jax.tree.map(blank, jax.eval_shape(wide, *args))
+    return repeat(0, (filled + width - 1) // width, put, out)

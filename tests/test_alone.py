@@ -36,6 +36,11 @@ def corner(restitution=None, n=12, boxes=0):
     return rbd.Scene(bodies, [rbd.Geom(rbd.Plane(), friction=0.5), *walls], dt=0.004)
 
 
+def every_pair_chosen(monkeypatch):
+    builder = sys.modules["rbd_jax.build"]
+    monkeypatch.setattr(builder, "COLOURED_PAIRS", dict.fromkeys(builder.COLOURED_PAIRS, 0))
+
+
 def many(model, one, worlds):
     rng = np.random.default_rng(0)
     state = rbd.batch(one, worlds)
@@ -98,6 +103,7 @@ def test_blocks_give_what_all_at_once_gives(filled):
 
 @pytest.mark.parametrize("restitution", (None, 0.7))
 def test_bits_depend_neither_on_the_batch_nor_on_cores(restitution, monkeypatch):
+    every_pair_chosen(monkeypatch)
     model, one = rbd.build(corner(restitution), method="fast")
     assert tiles.alone(model)
     state = many(model, one, 6)
@@ -121,8 +127,7 @@ def test_bits_depend_neither_on_the_batch_nor_on_cores(restitution, monkeypatch)
 @pytest.mark.parametrize("boxes, restitution", ((0, None), (0, 0.7), (6, None)))
 def test_the_same_steps_as_the_program_that_is_differentiated(boxes, restitution, monkeypatch):
     """That one goes through chunks of colours, this one through the live points in turn; converged they agree."""
-    builder = sys.modules["rbd_jax.build"]
-    monkeypatch.setattr(builder, "COLOURED_PAIRS", dict.fromkeys(builder.COLOURED_PAIRS, 0))
+    every_pair_chosen(monkeypatch)
     model, one = rbd.build(corner(restitution, boxes=boxes), method=rbd.Method("symtop2", "soft", PGS(sweeps=200)))
     assert tiles.alone(model)
     go = lambda s: rbd.rollout(model, s, 1, every=1)[0]

@@ -258,7 +258,7 @@ def test_a_frozen_world_made_no_step():
 def test_pairs_chosen_at_run_time(monkeypatch):
     import sys
 
-    for name in ("DENSE_PAIRS", "COLOURED_PAIRS"):
+    for name in ("DENSE_PAIRS", "COLOURED_PAIRS", "FLOATING_PAIRS"):
         monkeypatch.setattr(sys.modules["rbd_jax.build"], name, {("sphere", "sphere"): 0})
     _, _, _, seen = audited(scenes.two_spheres(restitution=1.0), "fast", 120)
     assert (seen.points > 0).any()

@@ -23,6 +23,7 @@ def choosing(monkeypatch, scene, method=TGS):
     with monkeypatch.context() as m:
         m.setattr(builder, "DENSE_PAIRS", EVERY_KIND)
         m.setattr(builder, "COLOURED_PAIRS", EVERY_KIND)
+        m.setattr(builder, "FLOATING_PAIRS", EVERY_KIND)
         return rbd.build(scene, method=method)
 
 

@@ -145,6 +145,30 @@ def test_an_argument_that_nothing_uses_is_no_trouble():
     assert float(call(jnp.float32(3), jnp.arange(5.0))) == 6
 
 
+def test_loops_take_in_and_carry_what_their_results_depend_on():
+    """XLA aborts where what reaches such a function turns out to be of no use in a loop of it."""
+    from rbd_jax.xla import _lean
+
+    def run(x, dead, unused, limit):
+        def body(carry):
+            k, a, b, c = carry
+            inner = jax.lax.while_loop(lambda c: c[0] < 2, lambda c: (c[0] + 1, c[1] + x, c[2] * dead), (0, a, b))
+            unused * 2.0
+            return k + 1, inner[1] + c, inner[2], c * 1.5
+
+        k, a, *_ = jax.lax.while_loop(lambda c: c[0] < limit, body, (0, x, dead, x))
+        return a
+
+    args = jnp.ones(3), jnp.ones(4), jnp.ones(5), jnp.int32(3)
+    whole = jax.make_jaxpr(run)(*args)
+    short, used = _lean(whole.jaxpr)
+    assert used == [True, False, False, True]
+    outer = short.eqns[-1]
+    assert len(outer.outvars) == 3, "the steps, the result and what is added to it"
+    got = jax.core.eval_jaxpr(short, whole.consts, args[0], args[3])[0]
+    assert np.array_equal(got, run(*args)) and np.array_equal(one_function(run)(*args), got)
+
+
 def test_a_large_single_result_is_refused():
     """XLA 0.10 fails to compile it in some programs (64 balls, 1,024 worlds, 25 steps): the sum of reaches was one."""
     x = jnp.ones((64, 128))
