@@ -23,7 +23,7 @@ from .state import Kinematic, State
 
 #: Groups with more pairs than this choose their pairs at run time (a box pair costs far more than a ball pair).
 DENSE_PAIRS = {("box", "box"): 100, ("sphere", "box"): 600, ("sphere", "sphere"): 2100}
-#: The same for a solver that goes through pairs: of fewer, most touch in some world of a tile, and all at once are faster.
+#: The same for a solver that goes through pairs: of fewer most touch in some world of a tile, and arrays are faster.
 COLOURED_PAIRS = {("box", "box"): 100, ("sphere", "box"): 500, ("sphere", "sphere"): 500}
 #: The same for such a solver where nothing pulls bodies together: few touch at a time.
 FLOATING_PAIRS = {("box", "box"): 100, ("sphere", "box"): 50, ("sphere", "sphere"): 50}
