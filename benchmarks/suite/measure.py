@@ -31,6 +31,8 @@ LIMIT = "limit"
 #: An error from here on is no solution.
 LOST = 1e3
 REPEATS = 4
+#: A call that takes longer [s] is timed with the worlds of the error run.
+LONG = 3.0
 TOO_SLOW = "an error run would take more than {:g} s"
 
 
@@ -59,7 +61,8 @@ class Sweep:
         self.case, self.engine, self.variant, self.dtype, self.job = case, engine, variant, dtype, job
         self.worlds = min(case.worlds, engine.most(case))
         self.any_worlds = engine.any_number or not engine.scales
-        self.cost = None  # seconds of a world and step
+        self.cost = None  # seconds of a world and step, as last seen
+        self.costs = {}  # the same of every step
 
     def load(self, dt, dtype=None):
         return self.engine.load(self.case, self.variant, dt, dtype or self.dtype)
@@ -90,6 +93,7 @@ class Sweep:
         begin = time.perf_counter()
         motion = simulation.motion(start, case.samples, steps)
         self.cost = (time.perf_counter() - begin) / (self.worlds * case.samples * steps)
+        self.costs[dt] = self.cost
         simulation.close()
         check_start(motion, start, dtype or self.dtype)
         return motion
@@ -108,15 +112,15 @@ class Sweep:
 
     def seconds(self, dt, batch: int, middle: Motion | None) -> tuple[dict, float | None]:
         """Wall seconds per simulated second and world: of the whole case, or from its middle where that is long."""
-        case, simulation = self.case, self.load(dt)
+        case, simulation, cost = self.case, self.load(dt), self.costs.get(dt, self.cost)
         try:
             whole = case.steps_a_sample(dt) * case.samples
             few = min(whole, 64)
             if self.engine.any_number:
                 if batch > 1:
-                    batch = max(2 * (os.cpu_count() or 1), min(batch, int(self.job.time_s / (self.cost * few))))
-                few = max(min(few, int(self.job.time_s / (self.cost * batch))), 1)
-            elif self.cost * batch * few > self.job.error_s:
+                    batch = max(2 * (os.cpu_count() or 1), min(batch, int(self.job.time_s / (cost * few))))
+                few = max(min(few, int(self.job.time_s / (cost * batch))), 1)
+            elif cost * batch * few > LONG:
                 batch = min(batch, self.worlds)  # whose program there is already
             start = case.start(min(batch, case.worlds)).worlds(batch)
             begin = time.perf_counter()
