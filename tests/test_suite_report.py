@@ -164,6 +164,15 @@ def test_verdicts(rows):
     assert not beaten.of("top", "1024").on_front and beaten.of("top", "1024").targets[1e-3].factor() == 0
 
 
+def test_an_engine_that_ran_at_few_steps_is_not_said_never_to_get_there():
+    """A time limit left MuJoCo one of five steps: nothing is known of the finer ones."""
+    ours = sweep("top", "ours", "fast", "float32", 1e-2, 2, 1e-6, 1e-7)
+    for count, tried in ((1, False), (3, True)):
+        rows = [*ours, *sweep("top", "mujoco", "euler", "float64", 1.0, 0, 0, 2e-6)[:count]]
+        reached = analysis.verdicts(rows, CASES).of("top", "1024").targets[1e-3]
+        assert reached.mujoco is None and ("mujoco" in reached.tried) == tried
+
+
 def test_changes_beyond_noise_only():
     later = {"date": "2026-01-02T00:00:00Z", "commit": "bbbbbbb"}
     flagged = lambda *rows: [(c.what, c.batch) for c in analysis.changes(rows) if c.flagged]

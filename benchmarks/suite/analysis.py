@@ -8,6 +8,7 @@ from __future__ import annotations
 import collections
 import dataclasses
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -258,7 +259,7 @@ class Reached:
 
     Attributes:
       ours: cheapest of our presets. own: of all variants of ours. mujoco: of MuJoCo C. peer: of the other engines.
-      tried: engines that have any point here.
+      tried: engines that reach it, or do not although they ran at half of the steps: of others nothing is known.
     """
 
     target: float
@@ -340,8 +341,16 @@ def _reached(found: list[Point], target: float) -> Reached:
         of(lambda r: r["engine"] == OURS),
         of(lambda r: r["engine"] == RIVAL),
         of(lambda r: r["engine"] not in (OURS, RIVAL)),
-        frozenset(p.row["engine"] for p in found),
+        frozenset(e for e in {p.row["engine"] for p in found} if e == OURS or _far_enough(found, e, target)),
     )
+
+
+def _far_enough(found: list[Point], engine: str, target: float) -> bool:
+    """Whether an engine reaches the error, or one of its variants ran at half of the steps that others ran at."""
+    mine = [p for p in found if p.row["engine"] == engine]
+    steps = {p.row["dt"] for p in found}
+    runs = Counter(v for v, _ in {(p.row["variant"], p.row["dt"]) for p in mine})
+    return cheapest(mine, target) is not None or 2 * max(runs.values()) >= len(steps)
 
 
 def _share(verdicts: list[Verdict], target: float, batch: str) -> Share:
