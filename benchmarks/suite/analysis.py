@@ -8,7 +8,6 @@ from __future__ import annotations
 import collections
 import dataclasses
 import math
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -349,7 +348,7 @@ def _far_enough(found: list[Point], engine: str, target: float) -> bool:
     """Whether an engine reaches the error, or one of its variants ran at half of the steps that others ran at."""
     mine = [p for p in found if p.row["engine"] == engine]
     steps = {p.row["dt"] for p in found}
-    runs = Counter(v for v, _ in {(p.row["variant"], p.row["dt"]) for p in mine})
+    runs = collections.Counter(v for v, _ in {(p.row["variant"], p.row["dt"]) for p in mine})
     return cheapest(mine, target) is not None or 2 * max(runs.values()) >= len(steps)
 
 

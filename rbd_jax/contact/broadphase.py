@@ -2,7 +2,7 @@
 
 Small groups look at every pair. A group with many pairs keeps those whose bounding boxes (balls: their
 surfaces), grown by the way the bodies move in a step, come together, in at most ``capacity`` places per world;
-one pair more sets the CAPACITY status bit of that world. Two ways to find them:
+one pair more sets the CAPACITY status bit of that world. Three ways to find them:
 
 * ``all_pairs`` compares everything with everything, 32 pairs to a word: about 1 ns a pair and world.
 * ``pairs_of_one`` does the same for one world in a program that is one function: it walks through the set bits.
@@ -157,7 +157,7 @@ def lookup_of_one(pairs: jax.Array, previous: jax.Array, filled: jax.Array) -> j
     return jax.lax.while_loop(lambda c: c[0] < filled, step, start)[2]
 
 
-# --- the two searches ---
+# --- the searches ---
 
 
 def _words(a: Bounds, b: Bounds, balls: bool, allowed: np.ndarray | None) -> jax.Array:

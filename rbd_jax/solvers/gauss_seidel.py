@@ -22,7 +22,7 @@ from .base import Problem, Solution
 from .colouring import Plan, plan
 from .laws import Law
 from .restitution import Events, normal_velocity, targets
-from .rows import Impulses, Index, Rows, add_trees, take, take_tree
+from .rows import Impulses, Index, Rows, add_trees, by_pair, take, take_tree
 
 #: Groups with more rows than this (slots x colours) loop over their slots instead of unrolling them.
 UNROLL = 4
@@ -149,11 +149,8 @@ def prepare(rows: Rows, problem: Problem) -> Group:
         rows, chunks = _planned(rows, problem)
     if not by_point or rows.filled is None:
         return _prepared(rows, problem, chunks)._with(points=_listed_points(rows) if by_point else None)
-    filled, bare = rows.filled, rows._with(filled=None)
-    if fixed:
-        raise TypeError("rows of one world that are filled in part name their bodies in an array")
-    g = in_blocks(lambda rows: _prepared(rows, problem, None), filled, bare)
-    return g._with(rows=g.rows._with(filled=filled), points=_listed_points(rows))
+    g = by_pair(lambda rows: _prepared(rows, problem, None), rows)
+    return g._with(rows=g.rows._with(filled=rows.filled), points=_listed_points(rows))
 
 
 def _prepared(rows: Rows, problem: Problem, chunks: Plan | None) -> Group:
