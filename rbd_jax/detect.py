@@ -27,13 +27,13 @@ from .contact.broadphase import (
     pairs_of_one,
     rows_of_key,
 )
-from .loops import BLOCK, each_pair, in_blocks, listed, repeat
+from .loops import BLOCK, Listed, each_pair, in_blocks, listed, repeat
 from .model import Coefficient, Group, GroupParams, Params, Structure
 from .solvers.rows import Impulses, Index, Rows, take, take_tree
 from .spatial import Quat, Vec3, safe_norm
 from .state import World
 from .struct import struct
-from .xla import in_one_function, largest, materialise, piece
+from .xla import in_a_thread, in_one_function, largest, materialise, piece
 
 
 @struct
@@ -60,7 +60,7 @@ def detect(s: Structure, p: Params, world: World, reach_of_model: str) -> tuple[
     whatever hits what in it; "step": those that may touch at the velocities of its start; "margin": those that
     touch, or are closer than MuJoCo's margin.
     """
-    alone = s.chooses and in_one_function() and world.step.shape == (1,)
+    alone = world.step.shape == (1,) and (in_a_thread() or s.chooses and in_one_function())
     reach = fastest = None
     if reach_of_model == "nearby":
         if sum(len(g.a) * g.slots for g in s.groups) > FEW:
@@ -113,8 +113,7 @@ class Selected:
     """The pairs of a group that are looked at: their bodies and numbers, (P, 1 or B).
 
     body_a, body_b: as in ``Rows``, of the geoms A and B. places: which of the group's pairs they are where
-    that differs from world to world, (P, B), else None. filled: places that hold a pair, None = all; count: how many,
-    of one world, where all the others come behind them, int32 ().
+    that differs from world to world, (P, B), else None. filled: places that hold a pair, None = all.
     """
 
     body_a: Index | jax.Array
@@ -122,7 +121,6 @@ class Selected:
     numbers: GroupParams
     places: jax.Array | None = None
     filled: jax.Array | None = None
-    count: jax.Array | None = None
 
 
 def everything(g: Group, gp: GroupParams) -> Selected:
@@ -139,10 +137,7 @@ def chosen(g: Group, gp: GroupParams, keys: jax.Array) -> Selected:
     body = lambda rows, k: jnp.asarray(np.maximum(rows, 0), jnp.int32)[k]
     c = g.choice
     none = no_key(len(c.a), len(c.b))
-    count = None
-    if in_one_function() and keys.shape[1] == 1:
-        count = below(keys, jnp.full((1, 1), none, jnp.int32))[0, 0]
-    return Selected(body(c.body_a, i), body(c.body_b, j), _numbers(g, gp, i, j), keys, keys < none, count)
+    return Selected(body(c.body_a, i), body(c.body_b, j), _numbers(g, gp, i, j), keys, keys < none)
 
 
 def geoms_of(g: Group, keys: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -259,7 +254,6 @@ def rows_of(g: Group, selected: Selected, m: Manifold, world: World) -> Rows:
         mu_spin=numbers.mu_spin,
         mu_roll=numbers.mu_roll,
         surface_spin=surface_spin,
-        filled=selected.count,
         feature=m.feature if g.features else None,
         law=numbers.law,
         central_a=g.central_a and index_a is not None,
@@ -272,19 +266,21 @@ def _group(
     g: Group, gp: GroupParams, p: Params, world: World, number: int, reach, fastest, reach_of_model, alone
 ) -> Contact:
     pairs = overflow = None
-    if g.choice is None:
-        selected = everything(g, gp)
-    else:
+    if g.choice is not None:
         pairs, overflow = _choose(g, gp, p, world, reach)
-        selected = chosen(g, gp, pairs)
-    reaches = None
-    if fastest is not None and g.capacity is None:
-        reaches = _ways(g, selected, p, world, fastest)
-    elif reach_of_model != "margin" and (reach_of_model == "step" or g.capacity is not None):
+
+    def looked_at(keys):
+        """Pairs that are looked at, and how far each side may come in the step."""
+        selected = everything(g, gp) if keys is None else chosen(g, gp, keys)
+        if fastest is not None and g.capacity is None:
+            return selected, _ways(g, selected, p, world, fastest)
+        if reach_of_model == "margin" or (reach_of_model != "step" and g.capacity is None):
+            return selected, None
         sides = ((side_of(g, "a"), selected.body_a), (side_of(g, "b"), selected.body_b))
         reaches = [take(reach, i) for c, i in sides if c == "dynamic"]
         if g.choice is not None and g.category == "kinematic":
             reaches.append(take(_sweep_of(p, world), selected.body_b if g.flip else selected.body_a))
+        return selected, reaches
 
     def narrow(selected, world, reaches, one):
         margin = jnp.inf if reach_of_model == "all" else 0.0
@@ -294,12 +290,21 @@ def _group(
             margin = selected.numbers.law.margin
         return manifold(g, selected, world, margin, one)
 
-    places = pairs
+    if in_one_function() and world.step.shape == (1,) and pairs is not None:
+        count = below(pairs, jnp.full((1, 1), no_key(len(g.choice.a), len(g.choice.b)), jnp.int32))[0, 0]
+        before = lookup_of_one(pairs, world.pairs[number], count)
+        return _in_blocks_of(g, p, world, number, looked_at, narrow, (pairs, before), count)._with(
+            pairs=pairs, overflow=overflow
+        )
+    selected, reaches = looked_at(pairs)
     if alone and fastest is not None and g.choice is None:
-        selected, reaches = _near_ones(g, selected, reaches, narrow(selected, world, reaches, p.one))
-        places = selected.places
-    if selected.count is not None:
-        return _in_blocks_of(g, p, world, number, selected, reaches, narrow, pairs, places, overflow)
+        near = _near_ones(g, narrow(selected, world, reaches, p.one))
+
+        def again(places):
+            return pick(selected, places), [c if c.shape[0] == 1 else at(c, places) for c in reaches]
+
+        places = near.order[:, None]
+        return _in_blocks_of(g, p, world, number, again, narrow, (places, places), near.count)._with(places=places)
     m = piece(narrow)(selected, world, reaches, p.one)
     if g.choice is not None:  # the solver gathers from the rows: not the narrow phase again for each of them
         m = m._with(**materialise(dict(normal=m.normal, point=m.point, distance=m.distance), p.one))
@@ -319,38 +324,37 @@ def _kept(m: Manifold, last: Impulses) -> tuple[Impulses, Impulses]:
 # --- one world in a program of loops: what does not touch costs nothing ---
 
 
-def _near_ones(g: Group, everything: Selected, reaches, m: Manifold) -> tuple[Selected, list[jax.Array]]:
-    """The pairs of a group that looks at all its pairs which have a live slot, in their order, and their reaches."""
+def _near_ones(g: Group, m: Manifold) -> Listed:
+    """The pairs of a group that looks at all its pairs which have a live slot, in their order."""
     live = m.live.any(axis=(0, 2))
-    if g.padding is not None:
-        live = live & ~g.padding
-    near = listed(live)
-    places = near.order[:, None]
-    filled = jnp.arange(len(places))[:, None] < near.count
-    selected = pick(everything, places)._with(filled=filled, count=near.count)
-    return selected, [c if c.shape[0] == 1 else at(c, places) for c in reaches]
+    return listed(live if g.padding is None else live & ~g.padding)
 
 
-def _in_blocks_of(g, p, world, number, selected: Selected, reaches, narrow, pairs, places, overflow) -> Contact:
-    """A contact of the pairs ``selected``, of which the first ``count`` are filled."""
-    count = selected.count
-    before = places if pairs is None else lookup_of_one(pairs, world.pairs[number], count)
+def _in_blocks_of(g, p, world, number, looked_at, narrow, listed, count) -> Contact:
+    """A contact of listed pairs, of which the first ``count`` are filled.
 
-    def block(selected, reaches, before):
+    listed: what ``looked_at`` takes, and the places of the pairs in the last step, (P, 1).
+    """
+
+    def block(keys, before, filled):
+        selected, reaches = looked_at(keys)
+        if filled is not None:
+            selected = selected._with(filled=filled)
         m = narrow(selected, world, reaches, p.one)
         m = m._with(**materialise(dict(normal=m.normal, point=m.point, distance=m.distance), p.one))
         rows = rows_of(g, selected, m, world)
         last = _found(g, world, number, before, rows.feature)
         return m, rows, *_kept(m, last), selected.numbers
 
-    args = selected._with(count=None), reaches, before
-    m, rows, last, warm, numbers = in_blocks(block, count, *args, width=_width(g))
-    return Contact(m, rows._with(filled=count), last, warm, pairs, overflow, numbers, places if pairs is None else None)
+    width = _width(g)
+    filled = None if width == 1 else jnp.arange(len(listed[0]))[:, None] < count
+    m, rows, last, warm, numbers = in_blocks(block, count, *listed, filled, width=width)
+    return Contact(m, rows._with(filled=count), last, warm, None, None, numbers)
 
 
 def _width(g: Group) -> int:
     """Pairs of a block: fewer where each costs more."""
-    return 1 if g.kind == ("box", "box") else max(BLOCK // g.slots, 1)
+    return 1 if g.kind == ("box", "box") or in_a_thread() else max(BLOCK // g.slots, 1)
 
 
 def of_places(contact: Contact, x):

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from .struct import struct
+from .xla import in_a_thread, unset
 
 
 def read(tree, row):
@@ -106,21 +107,21 @@ BLOCK = 16
 
 
 def in_blocks(f, filled: jax.Array | None, *args, width: int = BLOCK):
-    """``f(*args)``, trees of arrays (..., P, B), of the first ``filled`` pairs, block by block; zero behind them.
+    """``f(*args)``, trees of arrays (..., P, B), of the first ``filled`` pairs, block by block; any values behind them.
 
     f: of any number of pairs, each by itself. filled None: of all, at once.
     """
     if filled is None:
         return f(*args)
     pairs = max(c.shape[-2] for c in jax.tree.leaves(args))
-    width = min(width, pairs)
+    width = 1 if in_a_thread() else min(width, pairs)
     worlds = max(c.shape[-1] for c in jax.tree.leaves(args))
 
     def wide(*args):  # what is the same for all pairs, or all worlds, too
         return jax.tree.map(lambda c: c if jnp.ndim(c) > 1 else jnp.broadcast_to(c, (1, worlds)), f(*args))
 
     cut = lambda c, at: c if c.shape[-2] == 1 else jax.lax.dynamic_slice_in_dim(c, at, width, c.ndim - 2)
-    blank = lambda c: jnp.zeros((*c.shape[:-2], pairs, c.shape[-1]), c.dtype)
+    blank = lambda c: unset((*c.shape[:-2], pairs, c.shape[-1]), c.dtype)
 
     def put(k, out):
         at = jnp.minimum(k * width, pairs - width)  # the last block may hold pairs of the one before it

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .checks import whole
+from .kernel import by_thread
 from .memory import refuse
 from .model import Model, batch_of
 from .spatial import Vec3
@@ -206,7 +207,8 @@ def _step_batch(model: Model, state: State, wrench: Wrench | None, safe: bool = 
 
     def run(model, state):
         p, world = enter(model, state, batch)
-        world = advance(model, p, world, _hot_wrench(wrench, batch, state.x.x.dtype))
+        one = by_thread(lambda p, world, wrench: advance(model, p, world, wrench), math.prod(batch))
+        world = one(p, world, _hot_wrench(wrench, batch, state.x.x.dtype))
         return leave(model, p, world, batch)
 
     return _from_start(run, model, state, batch, safe)
@@ -272,10 +274,17 @@ def _loop(model, state, batch, wrench, steps, every, ask, blocks, truncate, nudg
             return held(controlled, p, world, None, model, wrench)[0], None
         return advance(model, p, world, hot), None
 
+    def plain(p, world, hot, count):
+        if count == 1:
+            return advance(model, p, world, hot)
+        return jax.lax.scan(lambda world, _: (advance(model, p, world, hot), None), world, None, length=count)[0]
+
     def run(world, cuts, count, blocks):
         """``count`` steps."""
         while blocks and blocks[0] >= count:
             blocks = blocks[1:]
+        if ask is None and cuts is None and not blocks:
+            return by_thread(functools.partial(plain, count=count), math.prod(batch))(p, world, hot), None
         if not blocks:
             return jax.lax.scan(one_step, world, cuts, length=count)[0], None
         return _in_blocks(run, world, cuts, count, blocks[0], blocks[1:])
@@ -283,7 +292,7 @@ def _loop(model, state, batch, wrench, steps, every, ask, blocks, truncate, nudg
     def interval(world, x, blocks):
         """The steps to the next sample."""
         cuts, change = x
-        if every == 1:
+        if every == 1 and (ask is not None or cuts is not None):
             world = one_step(world, None if cuts is None else cuts[0])[0]
         else:
             world = run(world, cuts, every, blocks)[0]

@@ -21,6 +21,7 @@ import math
 import jax
 import jax.numpy as jnp
 
+from .kernel import forward
 from .model import Model
 from .state import State, Wrench
 from .xla import on_cpu, one_function
@@ -96,7 +97,8 @@ def tiled(core, model: Model, state: State, wrench: Wrench | None, batch: tuple[
     """
     worlds = math.prod(batch)
     if not on_cpu():
-        return core(model, state, wrench)
+        with forward():
+            return core(model, state, wrench)
     tiles, width = width_of(worlds, parts, alone(model))
     if tiles * width == worlds and tiles == 1 and parts == 1:
         return single(core, width)(model, state, wrench)

@@ -15,6 +15,8 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Primitive
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.interpreters.partial_eval import dce_jaxpr
 
@@ -27,25 +29,28 @@ def opaque_one(x: jax.Array) -> jax.Array:
 def materialise(tree, one: jax.Array | float | None = 1.0):
     """The same values, computed once however many kernels use them (an infinite value becomes NaN).
 
-    ``one`` None leaves the fusion to XLA.
+    ``one`` None leaves the fusion to XLA. A thread of a GPU computes everything once.
 
     The divisor has the leaf's own shape: XLA turns a division by a broadcast array into a product with
     its reciprocal, which it duplicates again.
     """
-    if one is None:
+    if one is None or in_a_thread():
         return tree
     return jax.tree.map(lambda x: x / jax.lax.stop_gradient(one + 0.0 * x), tree)
 
 
 def materialise_linear(tree, like: jax.Array, one):
     """``materialise`` in a way that JAX sees is linear: the divisors are made of ``like``, of the leaves' shape."""
+    if in_a_thread():
+        return tree
     unit = jax.lax.stop_gradient(one + 0.0 * like)
     return jax.tree.map(lambda x: x / unit, tree)
 
 
 # --- one function of the CPU ---
 
-#: What is being traced becomes kernels, kernels and functions for its ``piece``s, or one function.
+#: What is being traced becomes "kernels", kernels and functions for its ``piece``s ("pieces"), "one" function, or what
+#: a "thread" of a GPU does.
 _kind = contextvars.ContextVar("kind", default="kernels")
 #: Operations that a ``part`` may have to become one function.
 _longest_part = contextvars.ContextVar("longest_part", default=0)
@@ -68,13 +73,36 @@ def on_cpu() -> bool:
     return jax.default_backend() == "cpu"
 
 
+def on_gpu() -> bool:
+    return jax.default_backend() == "gpu"
+
+
+def traced_for_a_thread():
+    """A context: what is traced within is what one thread of a GPU does for one world."""
+    return _traced_as("thread")
+
+
+def in_a_thread() -> bool:
+    """Whether what is being traced is what a thread of a GPU does for one world: what it keeps in memory costs most."""
+    return _kind.get() == "thread"
+
+
+_unset = Primitive("unset")
+_unset.def_abstract_eval(lambda shape, dtype: jax.core.ShapedArray(shape, dtype))
+
+
+def unset(shape: tuple[int, ...], dtype) -> jax.Array:
+    """An array of which only what is written is read: zeros, of which a thread of a GPU need not write any."""
+    return _unset.bind(shape=shape, dtype=np.dtype(dtype)) if in_a_thread() else jnp.zeros(shape, dtype)
+
+
 def in_one_function() -> bool:
-    """Whether what is being traced is to become one function of the CPU.
+    """Whether what is being traced is to become one function of the CPU, or of a thread of a GPU.
 
     There a loop over rows costs nothing but its arithmetic and may end early, and scatters do not exist; elsewhere
     every operation of a loop's body is a kernel that is started anew each time.
     """
-    return _kind.get() == "one"
+    return _kind.get() in ("one", "thread")
 
 
 def loops_are_cheap() -> bool:
@@ -115,7 +143,7 @@ def one_function(run, longest: int | None = None, longest_part: int = 0):
         if length is not None and (longest is None or length <= longest):
             # XLA's emitter of such functions cannot pass an argument by that nothing in them uses: there are none but
             # those that are used, and as XLA may find more than JAX to be of no use, all are results too
-            short, used = _lean(traced.jaxpr)
+            short, used = lean(traced.jaxpr)
             leaves = [c for c, u in zip(jax.tree.leaves(args), used, strict=True) if u]
             if _would_be_divided(short):
                 name = getattr(run, "__name__", run)
@@ -136,7 +164,7 @@ def one_function(run, longest: int | None = None, longest_part: int = 0):
     return call
 
 
-def _lean(jaxpr):
+def lean(jaxpr):
     """(jaxpr, used): the same without what is of no use, and which of its arguments are left.
 
     JAX's own elimination leaves ``while`` loops as they are, with all that their bodies close over and all that
@@ -233,7 +261,7 @@ def _length(jaxpr) -> int | None:
     for e in jaxpr.eqns:
         if e.primitive.name not in PLAIN or e.effects:
             return None
-        inside = [_length(j) for j in _inside(e.params)]
+        inside = [_length(j) for j in called(e.params)]
         if None in inside:
             return None
         total += sum(inside) or 1
@@ -251,10 +279,10 @@ WAITING = frozenset(
 
 def waits(jaxpr) -> bool:
     """Whether a program has such operations: two of it at a time can wait for each other for ever on a CPU."""
-    return any(e.primitive.name in WAITING or any(map(waits, _inside(e.params))) for e in jaxpr.eqns)
+    return any(e.primitive.name in WAITING or any(map(waits, called(e.params))) for e in jaxpr.eqns)
 
 
-def _inside(params):
+def called(params):
     """The jaxprs among an operation's parameters."""
     for value in params.values():
         for item in value if isinstance(value, (tuple, list)) else (value,):

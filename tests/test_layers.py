@@ -14,6 +14,7 @@ LAYER = {
     "xla": 1,
     "loops": 1,
     "implicit": 1,
+    "kernel": 2,
     "bodies": 2,
     "shapes": 2,
     "scene": 3,

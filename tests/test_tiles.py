@@ -147,7 +147,7 @@ def test_an_argument_that_nothing_uses_is_no_trouble():
 
 def test_loops_take_in_and_carry_what_their_results_depend_on():
     """XLA aborts where what reaches such a function turns out to be of no use in a loop of it."""
-    from rbd_jax.xla import _lean
+    from rbd_jax.xla import lean
 
     def run(x, dead, unused, limit):
         def body(carry):
@@ -161,7 +161,7 @@ def test_loops_take_in_and_carry_what_their_results_depend_on():
 
     args = jnp.ones(3), jnp.ones(4), jnp.ones(5), jnp.int32(3)
     whole = jax.make_jaxpr(run)(*args)
-    short, used = _lean(whole.jaxpr)
+    short, used = lean(whole.jaxpr)
     assert used == [True, False, False, True]
     outer = short.eqns[-1]
     assert len(outer.outvars) == 3, "the steps, the result and what is added to it"

@@ -17,7 +17,7 @@ import numpy as np
 from ..loops import Listed, in_blocks, listed, only_if, repeat
 from ..spatial import Vec3
 from ..struct import struct
-from ..xla import in_one_function, loops_are_cheap, materialise, piece, summed
+from ..xla import in_a_thread, in_one_function, loops_are_cheap, materialise, piece, summed
 from .base import Problem, Solution
 from .colouring import Plan, plan
 from .laws import Law
@@ -297,7 +297,7 @@ def in_phases(groups, soft, relaxed, lam, body, one, counts: tuple[int, int]):
     Returns the velocities and impulses of the end, and the velocities after the first phase. Of few worlds, whose
     program is long if it is to be fast, both phases are turns of one loop, which halves it (and takes a tenth longer).
     """
-    if not loops_are_cheap() or groups[0].rows.phi.shape[-1] >= FEW:
+    if not loops_are_cheap() or in_a_thread() or groups[0].rows.phi.shape[-1] >= FEW:
         moving, lam = sweeps(groups, soft, lam, body, one, counts[0])
         body, lam = sweeps(groups, relaxed(moving, lam), lam, moving, one, counts[1])
         return body, lam, moving
