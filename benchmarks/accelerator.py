@@ -1,18 +1,24 @@
-"""Batches on one device, a GPU above all: time per world-step, kernels of a step, scaling, bounds, and MJX beside.
+"""Batches on one device, a GPU above all: time per world-step, one kernel against XLA's, scaling, bounds, MJX beside.
 
-    PYTHONPATH=. python benchmarks/accelerator.py                (about 15 minutes on a GPU)
+    PYTHONPATH=. python benchmarks/accelerator.py                (about 5 minutes on a GPU and 16 cores)
     PYTHONPATH=. python benchmarks/accelerator.py --smoke --out /tmp/x
 
-Preset "fast", float32, ``rbd.rollout`` that stores the final state, results waited for, best of the repeats,
-compile time apart. Two bounds for free bodies, both of measured rates of this device: bytes, if every step reads and
-writes the state; arithmetic, if the steps are fused (XLA's count of one step's flops). The error at that speed, and
-that of MuJoCo's C engine, is that of ``throughput.py``. MJX is timed where it is installed, at its best batch. Appends
-to accelerator.jsonl and writes accelerator.md under ``--out`` (benchmarks/results).
+Preset "fast", float32, ``rbd.rollout`` that stores the final state, 1,024 start states repeated, results waited for,
+best of the repeats, compile time apart (programs are compiled side by side, nothing is timed meanwhile). On a GPU a
+rollout is one kernel (``rbd_jax.kernel``); "XLA's kernels" is the same program without it, which starts kernels for
+every step. Two bounds for free bodies, both of measured rates of this device: bytes, if every step reads and writes the
+state; arithmetic, if the steps are fused (XLA's count of one step's flops). The error at that speed, and that of
+MuJoCo's C engine, is that of ``throughput.py``. MJX is timed where it is installed, at the better of two batches.
+Appends to accelerator.jsonl and writes accelerator.md under ``--out`` (benchmarks/results).
 """
 
 from __future__ import annotations
 
+import concurrent.futures
+import functools
+import os
 import pathlib
+import re
 import sys
 import time
 
@@ -28,10 +34,23 @@ from rooflines import counted  # noqa: E402
 
 import rbd_jax as rbd  # noqa: E402
 from rbd_jax.memory import bytes_of  # noqa: E402
+from rbd_jax.rollout import _rollout_batch  # noqa: E402
+from rbd_jax.step import with_memory  # noqa: E402
 
-SCENES = ("isotropic", "asymmetric", "ball", "box", "stack", "pile16", "clutter")
-POWERS = range(10, 18)  # 2^10 to 2^17 worlds
+SCENES = ("isotropic", "asymmetric", "ball", "box", "stack", "clutter", "pile16", "pile64")
+POWERS = (10, 12, 14, 15, 16, 17)  # 2^10 to 2^17 worlds
+MORE = {"isotropic": (20, 22), "asymmetric": (20, 22), "ball": (20, 22), "box": (20,)}
+FEWER = {"stack": (10, 12, 15, 17), "clutter": (10, 12, 15, 17), "pile16": (10, 12, 15, 17), "pile64": (10, 13)}
 FREE = ("isotropic", "asymmetric")
+BY_XLA = {"isotropic": 17, "ball": 17, "box": 14}  # worlds of the row that XLA's own kernels make
+STEPS = {"isotropic": 1000, "asymmetric": 1000, "ball": 1000, "box": 200, "pile64": 10}
+#: MJX: (worlds, steps) of two runs.
+MJX_RUNS = {
+    "isotropic": ((8192, 50), (32768, 50)), "asymmetric": ((8192, 50), (32768, 50)),
+    "ball": ((8192, 50), (32768, 50)), "box": ((8192, 20), (32768, 20)), "stack": ((2048, 4), (8192, 4)),
+    "clutter": ((2048, 4), (8192, 4)), "pile16": ((2048, 4), (8192, 4)),
+}  # fmt: skip
+START = 1024
 BOUND_BAR, MJX_BAR = 50.0, 10.0
 
 
@@ -55,25 +74,77 @@ def bounds(size: int) -> dict:
     return {"bytes_per_s": 2 * x.nbytes / copied, "flops_per_s": 2 * terms * count * some.size / worked}
 
 
-def measure(name, powers, args, rates):
-    """A row per batch."""
+@functools.cache
+def some(name: str, size: int):
     scene, worlds = throughput.SCENES[name][0]()
     model, one = rbd.build(scene, dt=throughput.DT, method="fast")
-    steps = 20 if args.smoke else 500 if name in (*FREE, "ball") else 100
-    for power in powers:
-        size = 2**power
-        state = worlds(one, size, np.random.default_rng(1))
-        program = Program(throughput.last(steps), model, state)
-        took = least_seconds(lambda: program(model, state), args.repeats) / steps
-        cost = counted(jax.jit(lambda m, s: rbd.step(m, s)).lower(model, state).compile())
-        moved = 2 * bytes_of(state._with(memory=None))
-        yield {
-            "scene": name, "size": size, "steps": steps, "step_s": took, "ns": 1e9 * took / size,
-            "compile_s": program.total_s, "kernels": program._call.as_text().count(" fusion("),
-            "bytes_share": 100 * moved / took / rates["bytes_per_s"],
-            "flops_share": 100 * cost["flops"] / took / rates["flops_per_s"],
-            "status": int(np.asarray(program(model, state).status).max()),
+    return model, worlds(one, size, np.random.default_rng(1))._with(memory=None)
+
+
+def start(name: str, size: int):
+    """Model and worlds of a scene: START of them, repeated."""
+    model, state = some(name, min(START, size))
+    return model, jax.tree.map(lambda c: jnp.tile(c, (max(size // START, 1), *(1,) * (c.ndim - 1))), state)
+
+
+class Run:
+    """A scene at 2^power worlds: its program, compiled when it is asked for."""
+
+    def __init__(self, name: str, power: int, args, xla: bool = False):
+        self.name, self.size, self.xla = name, 2**power, xla
+        self.steps = 20 if args.smoke else STEPS.get(name, 50)
+        if xla:
+            self.steps = min(self.steps, 100)
+
+    def compile(self):
+        self.model, self.state = start(self.name, self.size)
+        steps = self.steps
+        bare = lambda m, s: _rollout_batch(m, with_memory(m, s), None, steps, steps)[0]
+        self.program = Program(bare if self.xla else throughput.last(steps), self.model, self.state)
+
+    def row(self, args, rates) -> dict:
+        took = least_seconds(lambda: self.program(self.model, self.state), args.repeats) / self.steps
+        row = {
+            "scene": self.name, "size": self.size, "steps": self.steps, "step_s": took, "ns": 1e9 * took / self.size,
+            "compile_s": self.program.total_s, "xla": self.xla,
+            "kernels": len(re.findall(r" (?:fusion|custom-call)\(", self.program._call.as_text())),
+            "status": int(np.asarray(self.program(self.model, self.state).status).max()),
         }  # fmt: skip
+        if self.name in FREE:
+            step = jax.jit(lambda m, s: _rollout_batch(m, s, None, 1, 1)[0])
+            flops = counted(step.lower(self.model, with_memory(self.model, self.state)).compile())["flops"]
+            moved = 2 * bytes_of(self.state._with(memory=None))
+            row["bytes_share"] = 100 * moved / took / rates["bytes_per_s"]
+            row["flops_share"] = 100 * flops / took / rates["flops_per_s"]
+            row["flops"] = flops / self.size
+        return row
+
+
+class MJXRun:
+    """A scene in MJX, likewise."""
+
+    def __init__(self, name: str, size: int, steps: int):
+        self.name, self.size, self.steps, self.call, self.reason = name, size, steps, None, ""
+
+    def compile(self):
+        begin = time.perf_counter()
+        try:
+            scene, _ = throughput.SCENES[self.name][0]()
+            run, self.start = throughput.mjx(scene, self.steps)(*start(self.name, self.size))
+            self.call = jax.jit(run).lower(*self.start).compile()
+        except Exception as error:
+            self.reason = f"{type(error).__name__}: {str(error)[:200]}"
+        self.compile_s = time.perf_counter() - begin
+
+    def row(self, args) -> dict:
+        row = {"scene": self.name, "size": self.size, "steps": self.steps}
+        if self.call is None:
+            return row | {"reason": self.reason or "not compiled in time"}
+        try:
+            took = least_seconds(lambda: jax.block_until_ready(self.call(*self.start)), args.repeats)
+        except Exception as error:
+            return row | {"reason": f"{type(error).__name__}: {str(error)[:200]}"}
+        return row | {"ns": 1e9 * took / self.steps / self.size, "compile_s": self.compile_s}
 
 
 def errors(name, args) -> dict:
@@ -90,27 +161,30 @@ def errors(name, args) -> dict:
 def report(env, rates, rows, wrong, rivals, took) -> str:
     cells, best = [], {}
     for r in rows:
-        best[r["scene"]] = min(best.get(r["scene"], r), r, key=lambda r: r["ns"])
-        shares = [number(r[k]) if r["scene"] in FREE else "-" for k in ("bytes_share", "flops_share")]
+        if not r["xla"]:
+            best[r["scene"]] = min(best.get(r["scene"], r), r, key=lambda r: r["ns"])
+        shares = [number(r.get(k)) for k in ("bytes_share", "flops_share")]
+        name = throughput.TITLES[r["scene"]] + (", XLA's kernels" if r["xla"] else "")
         cells.append(
-            [throughput.TITLES[r["scene"]], f"{r['size']:,}", number(r["ns"]), number(1e6 * r["step_s"]), r["kernels"]]
-            + [*shares, number(r["compile_s"]), r["status"] or ""]
+            [name, f"{r['size']:,}", number(r["ns"]), number(1e6 * r["step_s"]), number(1e9 / r["ns"]), *shares]
+            + [r["kernels"], number(r["compile_s"]), r["status"] or ""]
         )
-    heads = ["scene", "worlds", "ns a world-step", "us a step", "kernels", "% of bytes bound", "% of flops bound",
-             "compile [s]", "status"]  # fmt: skip
+    heads = ["scene", "worlds", "ns a world-step", "us a step", "world-steps/s", "% of bytes bound", "% of flops bound",
+             "kernels of the program", "compile [s]", "status"]  # fmt: skip
     against = []
-    for name, theirs in rivals.items():
-        done = [r for r in theirs if "ns_per_world_step" in r]
-        top = min(done, key=lambda r: r["ns_per_world_step"]) if done else None
-        ratio = top["ns_per_world_step"] / best[name]["ns"] if top else None
-        what = number(top["ns_per_world_step"]) if top else theirs[-1].get("reason", "-")
+    for name in dict.fromkeys(r["scene"] for r in rivals):
+        theirs = [r for r in rivals if r["scene"] == name]
+        done = [r for r in theirs if "ns" in r]
+        top = min(done, key=lambda r: r["ns"]) if done else None
+        ratio = top["ns"] / best[name]["ns"] if top else None
+        what = f"{number(top['ns'])} at {top['size']:,}" if top else theirs[-1]["reason"]
         against.append([throughput.TITLES[name], what, number(best[name]["ns"]), number(ratio), f"{MJX_BAR:g}",
                         verdict(ratio, MJX_BAR, least=True) if top else ""])  # fmt: skip
     seen = [
         [throughput.TITLES[name], throughput.QUANTITIES[key], number(value["ours"]), number(value["mujoco"])]
         for name, found in wrong.items() for key, value in found.items() if isinstance(value, dict)
     ]  # fmt: skip
-    free = max((max(r["bytes_share"], r["flops_share"]) for r in rows if r["scene"] == "isotropic"), default=None)
+    free = max((r["flops_share"] for r in rows if r["scene"] == "isotropic" and not r["xla"]), default=None)
     return f"""# One device
 
 {common.header(env)} Device: {jax.devices()[0].device_kind}.
@@ -119,8 +193,9 @@ Made by `benchmarks/accelerator.py` in {took:.0f} s. Measured: {rates["bytes_per
 
 {common.table(heads, cells)}
 
-Isotropic free bodies reach {number(free)} % of the bound that applies (bar {BOUND_BAR:g}:
-{verdict(free, BOUND_BAR, least=True)}).
+The steps of a rollout are fused, so that arithmetic bounds them, not bytes (of which more than 100 % are the sign): a
+division or a root counts as one flop here, though it takes eight instructions and more. Isotropic free bodies reach
+{number(free)} % of that bound (bar {BOUND_BAR:g}: {verdict(free, BOUND_BAR, least=True)}).
 
 ## Error at that speed
 
@@ -128,34 +203,66 @@ Isotropic free bodies reach {number(free)} % of the bound that applies (bar {BOU
 
 ## MJX
 
-{common.table(["scene", "MJX [ns]", "ours [ns]", "ratio", "bar", ""], against)}
+{common.table(["scene", "MJX [ns] at worlds", "ours [ns]", "ratio", "bar", ""], against)}
 """
+
+
+def compiled(runs, seconds: float):
+    """Compiles programs side by side; those that take longer are left."""
+    pool = concurrent.futures.ThreadPoolExecutor(max_workers=len(runs) or 1)
+    waiting = [pool.submit(run.compile) for run in runs]
+    done, _ = concurrent.futures.wait(waiting, timeout=seconds)
+    pool.shutdown(wait=False, cancel_futures=True)
+    for future in done:
+        future.result()
 
 
 def main(args) -> int:
     begin = time.perf_counter()
     out = args.out or common.RESULTS
-    env = common.environment() | {"device_kind": jax.devices()[0].device_kind}
+    env = common.environment() | {"device_kind": jax.devices()[0].device_kind, "benchmark": "accelerator"}
+    say = lambda text: print(f"{text}   ({time.perf_counter() - begin:.0f} s)", flush=True)
     print(common.header(env), env["device_kind"], flush=True)
     rates = bounds(2**16 if args.smoke else 2**28)
-    rows, wrong, rivals = [], {}, {}
-    for name in ("isotropic", "ball") if args.smoke else SCENES:
-        for row in measure(name, (6,) if args.smoke else POWERS, args, rates):
-            rows.append(row)
-            common.append_lines(out / "accelerator.jsonl", [{**env, "benchmark": "accelerator", **rates, **row}])
-            print(
-                f"{name:11s} {row['size']:8,d} {row['ns']:10.3f} ns   ({time.perf_counter() - begin:.0f} s)", flush=True
-            )
+    scenes = ("isotropic", "ball") if args.smoke else args.scenes or SCENES
+    powers = lambda name: (6,) if args.smoke else FEWER.get(name, (*POWERS, *MORE.get(name, ())))
+    runs = [Run(name, power, args) for name in scenes for power in powers(name)]
+    runs += [Run(name, power, args, xla=True) for name, power in BY_XLA.items() if name in scenes and not args.smoke]
+    first = {run.name: run for run in runs if not run.xla}  # the rest takes its C program
+    compiled(first.values(), 600)
+    compiled([run for run in runs if run not in first.values()], 600)
+    say("compiled")
+    rows, wrong, theirs = [], {}, []
+    for run in runs:
+        rows.append(run.row(args, rates))
+        common.append_lines(out / "accelerator.jsonl", [{**env, **rates, **rows[-1]}])
+        say(f"{run.name:11s} {run.size:8,d} {rows[-1]['ns']:10.4f} ns{' XLA' if run.xla else ''}")
+    write = lambda: (out / "accelerator.md").write_text(
+        report(env, rates, rows, wrong, theirs, time.perf_counter() - begin), encoding="utf-8"
+    )
+    write()
+    for name in scenes:
         wrong[name] = errors(name, args)
-        if not args.smoke:
-            rivals[name] = throughput.mjx_rows(name, args, env)
-            common.append_lines(out / "accelerator.jsonl", rivals[name])
-        jax.clear_caches()
-    page = report(env, rates, rows, wrong, rivals, time.perf_counter() - begin)
-    (out / "accelerator.md").write_text(page, encoding="utf-8")
-    print(f"wrote {out / 'accelerator.jsonl'}, {out / 'accelerator.md'}")
+        common.append_lines(out / "accelerator.jsonl", [{**env, "scene": name, "error": wrong[name]}])
+        say(f"{name:11s} errors")
+    write()
+    if not args.smoke:
+        rivals = [MJXRun(name, *run) for name in scenes for run in MJX_RUNS.get(name, ())]
+        compiled(rivals, max(args.seconds - (time.perf_counter() - begin), 1.0))
+        say("MJX compiled")
+        for run in rivals:
+            theirs.append(run.row(args))
+            common.append_lines(out / "accelerator.jsonl", [{**env, "engine": "mjx", **theirs[-1]}])
+            say(f"{run.name:11s} MJX {run.size:8,d} {theirs[-1].get('ns') or theirs[-1]['reason']}")
+            write()
+    print(f"wrote {out / 'accelerator.jsonl'}, {out / 'accelerator.md'}", flush=True)
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(common.options(__doc__, "two scenes, few worlds").parse_args()))
+    parser = common.options(__doc__, "two scenes, few worlds")
+    parser.add_argument("--scenes", nargs="+", choices=SCENES, metavar="SCENE")
+    parser.add_argument("--seconds", type=float, default=600.0, help="what MJX has not compiled until then is left out")
+    code = main(parser.parse_args())
+    sys.stdout.flush()
+    os._exit(code)  # a program that is still being compiled would be waited for

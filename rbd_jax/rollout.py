@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import functools
 import math
+import types
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from .checks import whole
-from .kernel import by_thread
+from .kernel import repeated
 from .memory import refuse
 from .model import Model, batch_of
 from .spatial import Vec3
@@ -207,8 +208,8 @@ def _step_batch(model: Model, state: State, wrench: Wrench | None, safe: bool = 
 
     def run(model, state):
         p, world = enter(model, state, batch)
-        one = by_thread(lambda p, world, wrench: advance(model, p, world, wrench), math.prod(batch))
-        world = one(p, world, _hot_wrench(wrench, batch, state.x.x.dtype))
+        hot = _hot_wrench(wrench, batch, state.x.x.dtype)
+        world = repeated(_advance(model.structure, model.method), world, p, hot, worlds=math.prod(batch), count=1)
         return leave(model, p, world, batch)
 
     return _from_start(run, model, state, batch, safe)
@@ -225,6 +226,13 @@ def _from_start(run, model: Model, state: State, batch, safe: bool):
         return run(model, marked(state, lost))
     out = run(*harmless(model, state, lost))
     return jax.tree.map(lambda s: restored(s, state, lost), out, is_leaf=lambda s: isinstance(s, State))
+
+
+@functools.lru_cache(maxsize=64)
+def _advance(structure, method):
+    """``advance`` of models of this kind, with the world first; one object for each."""
+    kind = types.SimpleNamespace(structure=structure, method=method)
+    return lambda world, p, wrench: advance(kind, p, world, wrench)
 
 
 def _sample(model: Model, p, world: World) -> State:
@@ -274,17 +282,14 @@ def _loop(model, state, batch, wrench, steps, every, ask, blocks, truncate, nudg
             return held(controlled, p, world, None, model, wrench)[0], None
         return advance(model, p, world, hot), None
 
-    def plain(p, world, hot, count):
-        if count == 1:
-            return advance(model, p, world, hot)
-        return jax.lax.scan(lambda world, _: (advance(model, p, world, hot), None), world, None, length=count)[0]
-
     def run(world, cuts, count, blocks):
         """``count`` steps."""
         while blocks and blocks[0] >= count:
             blocks = blocks[1:]
         if ask is None and cuts is None and not blocks:
-            return by_thread(functools.partial(plain, count=count), math.prod(batch))(p, world, hot), None
+            return repeated(
+                _advance(model.structure, model.method), world, p, hot, worlds=math.prod(batch), count=count
+            ), None
         if not blocks:
             return jax.lax.scan(one_step, world, cuts, length=count)[0], None
         return _in_blocks(run, world, cuts, count, blocks[0], blocks[1:])

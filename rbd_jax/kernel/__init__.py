@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import contextvars
+import functools
 import math
 import warnings
 
@@ -18,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..loops import repeat
 from ..xla import lean, on_gpu, traced_for_a_thread
 from .emit import Leaf, source
 from .flat import Unsupported, flatten
@@ -29,11 +31,13 @@ TARGET = "__gpu$xla.gpu.ptx"
 NAME = "rbd_worlds"
 #: Threads of a block, and of one where there would be fewer blocks than a GPU can run at once.
 BLOCK, SMALL_BLOCK, MANY_BLOCKS = 64, 32, 1024
+#: Threads whose arrays are in a buffer: one after the other, each runs the worlds that are left.
+MOST_THREADS = 32_768
 
 
 @contextlib.contextmanager
 def forward():
-    """What is traced within is not differentiated: ``by_thread`` may make kernels of it."""
+    """What is traced within is not differentiated: ``repeated`` may make kernels of it."""
     token = _forward.set(True)
     try:
         yield
@@ -41,58 +45,80 @@ def forward():
         _forward.reset(token)
 
 
-def by_thread(run, worlds: int):
-    """``run(*args)`` of as many worlds, each by a thread of its own where that can be; elsewhere ``run`` itself.
+def repeated(run, world, *given, worlds: int, count: int):
+    """``world = run(world, *given)``, ``count`` times (fixed), of as many worlds.
 
-    All leaves of ``args`` have an axis of worlds at the end, or one element there (or none) for what they share; those
-    of the results have it. What becomes of a world must not depend on the others.
+    All leaves of ``world`` have an axis of worlds at the end, those of ``given`` too or one element there (or no axis)
+    for what the worlds share. What becomes of a world must not depend on the others: where that can be, each is a
+    thread of a kernel of its own. The number of steps is no part of that kernel's code, nor is that of the worlds;
+    the same function ``run`` has the same kernel.
     """
-
-    def call(*args):
-        if not (_forward.get() and on_gpu()):
-            return run(*args)
+    if _forward.get() and on_gpu():
         try:
-            text, used, shape = program(run, worlds, *args)
-            code = ptx(text, _capability())
+            return launched(_many(run), worlds, jnp.full((1,), count, jnp.int32), world, *given)
         except (Unsupported, CompileError) as reason:
             warnings.warn(f"these steps are not one kernel of the GPU, and slower: {reason}", stacklevel=2)
-            return run(*args)
-        leaves = [jnp.asarray(c) for c, u in zip(jax.tree.leaves(args), used, strict=True) if u]
-        results = [jax.ShapeDtypeStruct((*c.shape[:-1], worlds), c.dtype) for c in jax.tree.leaves(shape)]
-        return jax.tree.structure(shape).unflatten(launched(code, worlds, leaves, results))
-
-    return call
+    if count == 1:
+        return run(world, *given)
+    return jax.lax.scan(lambda world, _: (run(world, *given), None), world, None, length=count)[0]
 
 
 def program(run, worlds: int, *args):
-    """(text, used, shape): the C of ``run`` for one world, which leaves of ``args`` it takes, and its results.
+    """(source, used, shape): the C of ``run`` for one world, which leaves of ``args`` it takes, and its results.
+
+    One program for every number of worlds, as long as ``run`` is the same function.
 
     Raises:
       Unsupported: it has no place in one kernel.
     """
     leaves, tree = jax.tree.flatten(args)
     own = [bool(jnp.ndim(c)) and jnp.shape(c)[-1] == worlds for c in leaves]
-    one = [jax.ShapeDtypeStruct((*jnp.shape(c)[:-1], 1) if o else jnp.shape(c), c.dtype) for c, o in zip(leaves, own)]
+    one = [((*jnp.shape(c)[:-1], 1) if o else jnp.shape(c), jnp.result_type(c)) for c, o in zip(leaves, own)]
+    return _program(run, tree, tuple(one), tuple(own))
+
+
+@functools.lru_cache(maxsize=64)
+def _program(run, tree, one, own):
+    shapes = [jax.ShapeDtypeStruct(*c) for c in one]
     with traced_for_a_thread():
-        traced, shape = jax.make_jaxpr(run, return_shape=True)(*tree.unflatten(one))
+        traced, shape = jax.make_jaxpr(run, return_shape=True)(*tree.unflatten(shapes))
     if any(isinstance(c, jax.core.Tracer) for c in traced.consts):
         raise Unsupported("it closes over a traced value")
     short, used = lean(traced.jaxpr)
-    arguments = [Leaf(math.prod(c.shape), c.dtype.name, o) for c, o, u in zip(one, own, used, strict=True) if u]
+    arguments = [Leaf(math.prod(c.shape), c.dtype.name, o) for c, o, u in zip(shapes, own, used, strict=True) if u]
     results = [Leaf(math.prod(c.shape), c.dtype.name, True) for c in jax.tree.leaves(shape)]
     return source(flatten(short, traced.consts), arguments, results, NAME), used, shape
 
 
-def launched(code: str, worlds: int, leaves, results):
-    """The results of a kernel given as PTX."""
+@functools.lru_cache(maxsize=64)
+def _many(run):
+    """``world = run(world, *given)``, ``n[0]`` times."""
+    return lambda n, world, *given: repeat(0, n[0], lambda _, world: run(world, *given), world)
+
+
+def launched(run, worlds: int, *args):
+    """``run(*args)`` as one kernel.
+
+    Raises:
+      Unsupported, CompileError: it cannot be.
+    """
+    made, used, shape = program(run, worlds, *args)
+    code = ptx(made.text, capability())
+    leaves = [jnp.asarray(c) for c, u in zip(jax.tree.leaves(args), used, strict=True) if u]
+    results = [jax.ShapeDtypeStruct((*c.shape[:-1], worlds), c.dtype) for c in jax.tree.leaves(shape)]
     block = SMALL_BLOCK if worlds < BLOCK * MANY_BLOCKS else BLOCK
-    whole = dict(grid_x=-(-worlds // block), grid_y=1, grid_z=1, block_x=block, block_y=1, block_z=1)
-    attributes = {k: np.int32(v) for k, v in whole.items()} | {"shared_mem_bytes": np.int32(0)}
+    blocks = -(-worlds // block)
+    if made.pools:
+        blocks = min(blocks, MOST_THREADS // block)
+        results += [jax.ShapeDtypeStruct((blocks * block * size,), dtype) for dtype, size in made.pools]
+    shapes = dict(grid_x=blocks, grid_y=1, grid_z=1, block_x=block, block_y=1, block_z=1)
+    numbers = {k: np.int32(v) for k, v in (shapes | {"shared_mem_bytes": 0}).items()}
     call = jax.ffi.ffi_call(TARGET, results)
-    return call(
-        jnp.full((1,), worlds, jnp.int32), *leaves, name=NAME, kernel_type="ptx", kernel_data=code, **attributes
-    )
+    out = call(jnp.full((1,), worlds, jnp.int32), *leaves, name=NAME, kernel_type="ptx", kernel_data=code, **numbers)
+    kind = jax.tree.structure(shape)
+    return kind.unflatten(out[: kind.num_leaves])
 
 
-def _capability() -> str:
+def capability() -> str:
+    """Compute capability of the GPU, "9.0" for instance."""
     return jax.devices()[0].compute_capability

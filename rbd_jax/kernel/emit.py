@@ -19,11 +19,15 @@ from .operations import PRELUDE, expression, literal, type_of
 
 #: Loops over no more elements are written out by the compiler, so that their arrays can live in registers.
 UNROLLED = 16
-#: Bytes of arrays that a thread may have. All threads that a GPU can hold get so much at once.
-MEMORY = 96 * 1024
+#: Bytes of arrays in a thread's own memory: all threads that a GPU can hold get so much at once, 17 GB of an H100. With
+#: more they are in a buffer for the threads that are started, which then are no more than those of ``program``.
+LOCAL = 64 * 1024
+#: Bytes of arrays of a thread at most.
+MEMORY = 1024 * 1024
 
 _REDUCTIONS = {"reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_or": "or", "reduce_and": "and",
                "reduce_prod": "mul"}  # fmt: skip
+_SCATTERS = {"scatter": None, "scatter-add": "add", "scatter-mul": "mul", "scatter-min": "min", "scatter-max": "max"}
 _VIEWS = frozenset("broadcast_in_dim transpose slice rev".split())
 
 
@@ -98,7 +102,7 @@ class Emitter:
         if size > UNROLLED:
             pool = self.pools.setdefault(np.dtype(dtype).name, Pool(dtype, f"pool{len(self.pools)}"))
             first = pool.take(size)
-            at = lambda k: f"{pool.name}[{_plus(first, k)}]"
+            at = lambda k: f"{pool.name}[AT({_plus(first, k)})]"
             return Array(at, size, name, self.depth, place=(pool, first))
         self.line(f"{kind} {name}[{size}];")
         return Array(lambda k: f"{name}[{k}]", size, name, self.depth)
@@ -348,6 +352,8 @@ class Scope:
             getattr(self, "_" + op.name)(op)
         elif op.name == "dynamic_update_slice":
             self._update(i, op)
+        elif op.name in _SCATTERS:
+            self._scatter(i, op)
         elif op.name in LOOPS:
             self.flush()
             getattr(self, "_" + op.name)(i, op)
@@ -359,7 +365,9 @@ class Scope:
         for v in op.ins:
             v = whole(v)
             # an element at the same place is read in the loop itself
-            elsewhere = op.name == "dynamic_slice" or op.name == "gather" and (v is whole(op.ins[0]) or not _in_step(op))
+            elsewhere = (
+                op.name == "dynamic_slice" or op.name == "gather" and (v is whole(op.ins[0]) or not _in_step(op))
+            )
             if isinstance(v, Var) and v in self.waits and (self.waits[v] != out.size or elsewhere):
                 self.flush(self.waits[v])
         if out.size == 1:
@@ -497,11 +505,46 @@ class Scope:
                 text = f"({' && '.join(checks)} ? {text} : {literal(np.asarray(fill, op.outs[0].dtype))})"
         return text
 
+    def _scatter(self, i: int, op: Op) -> None:
+        old, index, new = op.ins
+        d, join = op.params["dimension_numbers"], _SCATTERS[op.name]
+        self.flush()
+        where, values = self.value(index), self.value(new)
+        target = self._owned(i, old, self.value(old), op)
+        self._hold(op.outs[0], target)
+        gone = sorted({*d.inserted_window_dims, *d.operand_batching_dims})
+        window = [new.shape[j] for j in d.update_window_dims]
+        sizes = dict(zip([j for j in range(len(old.shape)) if j not in gone], window)) | dict.fromkeys(gone, 1)
+
+        def put(k):
+            digits = _digits(k, new.shape)
+            batch = [x for j, x in enumerate(digits) if j not in d.update_window_dims]
+            rest = iter([digits[j] for j in d.update_window_dims])
+            at, fits = [], []
+            for axis, n in enumerate(old.shape):
+                terms = [] if axis in gone else [next(rest)]
+                if axis in d.operand_batching_dims:
+                    terms.append(batch[d.scatter_indices_batching_dims[d.operand_batching_dims.index(axis)]])
+                if axis in d.scatter_dims_to_operand_dims:
+                    column = str(d.scatter_dims_to_operand_dims.index(axis))
+                    start, last = where.at(_flat([*batch, column], index.shape)), n - sizes[axis]
+                    if "CLIP" in str(op.params["mode"]):
+                        start = f"inside({start}, {last})"
+                    elif "PROMISE" not in str(op.params["mode"]):
+                        fits.append(f"(unsigned)({start}) <= {last}u")
+                    terms.append(start)
+                at.append(_plus(*terms) if terms else "0")
+            place, kind = target.at(_flat(at, old.shape)), old.dtype
+            text = values.at(k) if join is None else expression(join, [place, values.at(k)], [kind, kind], kind, {})
+            self.e.line((f"if ({' && '.join(fits)}) " if fits else "") + f"{place} = {text};")
+
+        self.e.loop(new.size, put)
+
     def _reduce(self, op: Op) -> None:
         source, (out,) = op.ins[0], op.outs
         base, axes, shape = self.value(source), op.params["axes"], tuple(source.shape)
         kind, join = np.dtype(out.dtype), _REDUCTIONS[op.name]
-        first = {"add": 0, "mul": 1, "or": False if kind == bool else 0, "and": True if kind == bool else -1}.get(join)
+        first = {"add": 0, "mul": 1, "or": 0, "and": True if kind.kind == "b" else -1}.get(join)
         target = self._hold(out, self.e.declare(out.dtype, out.size))
         inner = [shape[a] for a in axes]
         count = int(np.prod(inner, dtype=np.int64))
@@ -692,52 +735,67 @@ class Leaf:
     own: bool
 
 
-def source(program: Flat, arguments: list[Leaf], results: list[Leaf], name: str) -> str:
-    """The text of a function of C: ``name(worlds, arguments..., results...)``, all pointers, element by world.
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """The text of a kernel, and the pools (dtype, elements) of a thread that it takes as its last results."""
+
+    text: str
+    pools: tuple[tuple[str, int], ...]
+
+
+def source(program: Flat, arguments: list[Leaf], results: list[Leaf], name: str) -> Source:
+    """A function of C, ``name(worlds, arguments..., results..., pools...)``, all pointers, element by world.
 
     Raises:
       Unsupported: an operation has no place in it, or a thread would need too much memory.
     """
     e = Emitter()
-    at = lambda leaf, text: (lambda k: f"{text}[{_plus(_times(k, 1))} * worlds + world]") if leaf.own else (
-        lambda k: f"{text}[{k}]"
-    )  # fmt: skip
     values = []
     for j, (leaf, var) in enumerate(zip(arguments, program.ins, strict=True)):
-        given = Array(at(leaf, f"a{j}"), leaf.size)
+        given = Array(_element_of(leaf, f"a{j}"), leaf.size)
         if leaf.size == 1:
             text = e.name()
             e.line(f"const {type_of(var.dtype)} {text} = {given.at('0')};")
             given = Array(lambda k, text=text: text, 1)
         values.append(given)
     for j, (leaf, value) in enumerate(zip(results, Scope(e, program, values).run(), strict=True)):
-        put = at(leaf, f"r{j}")
+        put = _element_of(leaf, f"r{j}")
         e.loop(leaf.size, lambda k: e.line(f"{put(k)} = {value.at(k)};"), unroll=False)
-    ins = [f"const {type_of(leaf.dtype)}* __restrict__ a{j}" for j, leaf in enumerate(arguments)]
-    outs = [f"{type_of(leaf.dtype)}* __restrict__ r{j}" for j, leaf in enumerate(results)]
-    pointers = ", ".join(["const int* __restrict__ batch", *ins, *outs])
-    begin = f"""
-#ifdef __CUDACC_RTC__
-extern "C" __global__ void {name}({pointers}) {{
-  const int worlds = *batch, world = blockIdx.x * blockDim.x + threadIdx.x;
-  if (world >= worlds) return;
-#else
-static void of_one({pointers}, const int world) {{
-  const int worlds = *batch;
-#endif
-"""
-    cast = lambda j, kind: f"({kind})p[{j}]"
-    kinds = ["const int*", *(f"const {type_of(c.dtype)}*" for c in arguments), *(f"{type_of(c.dtype)}*" for c in results)]
-    unpacked = ", ".join(cast(j, kind) for j, kind in enumerate(kinds))
-    end = f"""}}
-#ifndef __CUDACC_RTC__
-extern "C" void {name}(void** p) {{
-  const int worlds = *(const int*)p[0];
-  for (int world = 0; world < worlds; ++world) of_one({unpacked}, world);
-}}
-#endif
-"""
     if e.memory > MEMORY:
         raise Unsupported(f"{e.memory} bytes of arrays for a thread, of which it may have {MEMORY}")
-    pools = [f"  {type_of(pool.dtype)} {pool.name}[{pool.size}];" for pool in e.pools.values()]
-    return "\n".join([PRELUDE, *e.table_lines, begin, *pools, *e.lines, end])
+    pools = list(e.pools.values())
+    own = e.memory <= LOCAL
+    kinds = ["const int*", *(f"const {type_of(c.dtype)}*" for c in arguments)]
+    kinds += [f"{type_of(c.dtype)}*" for c in results]
+    names = ["batch", *(f"a{j}" for j in range(len(arguments))), *(f"r{j}" for j in range(len(results)))]
+    if not own:
+        kinds += [f"{type_of(pool.dtype)}*" for pool in pools]
+        names += [pool.name for pool in pools]
+    pointers = ", ".join(f"{kind} __restrict__ {name}" for kind, name in zip(kinds, names))
+    unpacked = ", ".join(f"({kind})p[{j}]" for j, kind in enumerate(kinds))
+    local = [f"  {type_of(pool.dtype)} {pool.name}[{pool.size}];" for pool in pools] if own else []
+    text = f"""
+#define AT(k) {"(k)" if own else "((size_t)(k) * threads + thread)"}
+#ifdef __CUDACC_RTC__
+extern "C" __global__ void {name}({pointers}) {{
+  const int worlds = *batch, thread = blockIdx.x * blockDim.x + threadIdx.x, threads = gridDim.x * blockDim.x;
+#else
+extern "C" void {name}(void** p);
+static void all_of({pointers}) {{
+  const int worlds = *batch, thread = 0, threads = 1;
+#endif
+  for (int world = thread; world < worlds; world += threads) {{
+"""
+    end = f"""  }}
+}}
+#ifndef __CUDACC_RTC__
+extern "C" void {name}(void** p) {{ all_of({unpacked}); }}
+#endif
+"""
+    given = () if own else tuple((pool.dtype.name, pool.size) for pool in pools)
+    return Source("\n".join([PRELUDE, *e.table_lines, text, *local, *e.lines, end]), given)
+
+
+def _element_of(leaf: Leaf, text: str):
+    """Element k of a leaf, in C."""
+    return lambda k: f"{text}[(size_t){_times(k, 1)} * worlds + world]" if leaf.own else f"{text}[{k}]"

@@ -22,7 +22,7 @@ def type_of(dtype) -> str:
 def literal(x) -> str:
     """A number as C writes it."""
     dtype = np.asarray(x).dtype
-    if dtype == bool:
+    if dtype.kind == "b":
         return "true" if x else "false"
     if dtype.kind in "iu":
         text = str(int(x)) + {"uint32": "u", "int64": "ll", "uint64": "ull"}.get(dtype.name, "")
@@ -95,7 +95,7 @@ def expression(name: str, ins: list[str], dtypes, out, params) -> str | None:
     """
     real = dtypes and np.dtype(dtypes[0]).kind == "f"
     tail = "f" if real and np.dtype(dtypes[0]) == np.float32 else ""
-    logical = np.dtype(out) == bool
+    logical = np.dtype(out).kind == "b"
     a, b = (*ins, None, None)[:2]
     if name in _INFIX:
         return f"({a} {_INFIX[name]} {b})"
