@@ -266,7 +266,7 @@ def test_what_cannot_be_a_kernel_is_said_and_runs_without(as_if_gpu, monkeypatch
 
 
 @on_gpu
-@pytest.mark.parametrize("name", ["top", "ball", "box", "mixed"])
+@pytest.mark.parametrize("name", ["top", "ball", "box"])
 def test_on_a_gpu_it_gives_what_xla_gives(name):
     model, state = built(name)
     with warnings.catch_warnings():
