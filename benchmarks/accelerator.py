@@ -7,7 +7,7 @@ Preset "fast", float32, ``rbd.rollout`` that stores the final state, 1,024 start
 best of the repeats, compile time apart (programs are compiled side by side, nothing is timed meanwhile). On a GPU a
 rollout is one kernel (``rbd_jax.kernel``); "XLA's kernels" is the same program without it, which starts kernels for
 every step. Two bounds for free bodies, both of measured rates of this device: bytes, if every step reads and writes the
-state; arithmetic, if the steps are fused (XLA's count of one step's flops). The error at that speed, and that of
+state; instructions that threads issue, if the steps are fused. The error at that speed, and that of
 MuJoCo's C engine, is that of ``throughput.py``. MJX is timed where it is installed, at the better of two batches.
 Appends to accelerator.jsonl and writes accelerator.md under ``--out`` (benchmarks/results).
 """
@@ -30,12 +30,13 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import common  # noqa: E402
 import throughput  # noqa: E402
 from common import MuJoCo, Program, least_seconds, number, verdict  # noqa: E402
-from rooflines import counted  # noqa: E402
 
 import rbd_jax as rbd  # noqa: E402
+from rbd_jax import kernel  # noqa: E402
 from rbd_jax.memory import bytes_of  # noqa: E402
-from rbd_jax.rollout import _rollout_batch  # noqa: E402
-from rbd_jax.step import with_memory  # noqa: E402
+from rbd_jax.rollout import _advance, _rollout_batch  # noqa: E402
+from rbd_jax.step import enter, with_memory  # noqa: E402
+from rbd_jax.xla import on_gpu  # noqa: E402
 
 SCENES = ("isotropic", "asymmetric", "ball", "box", "stack", "clutter", "pile16", "pile64")
 POWERS = (10, 12, 14, 15, 16, 17)  # 2^10 to 2^17 worlds
@@ -55,23 +56,44 @@ BOUND_BAR, MJX_BAR = 50.0, 10.0
 
 
 def bounds(size: int) -> dict:
-    """Measured rates of the device: bytes/s of a copy of ``size`` floats, flops/s of multiply-adds."""
+    """Measured rates of the device: bytes/s of a copy of ``size`` floats; multiply-adds/s of threads, a GPU's only."""
     x = jnp.linspace(0.1, 0.9, size, dtype=jnp.float32)
-    copy, terms, count = jax.jit(lambda x: x + np.float32(1)), 64, 100
+    copy = jax.jit(lambda x: x + np.float32(1))
+    rates = {"bytes_per_s": 2 * x.nbytes / least_seconds(lambda: jax.block_until_ready(copy(x)), 5)}
+    if on_gpu():
+        worlds, terms, count = 2**21, 64, 1000
 
-    def polynomials(x):
-        def body(_, y):
+        def polynomial(y, x):
             for k in range(terms):
                 y = y * x + np.float32(0.001 * k)
             return y
 
-        return jax.lax.fori_loop(0, count, body, x)
+        def run(x):
+            with kernel.forward():
+                return kernel.repeated(polynomial, x, x, worlds=worlds, count=count)
 
-    some = x[: max(size // 64, 1)]
-    run = jax.jit(polynomials)
-    copied = least_seconds(lambda: jax.block_until_ready(copy(x)), 5)
-    worked = least_seconds(lambda: jax.block_until_ready(run(some)), 5)
-    return {"bytes_per_s": 2 * x.nbytes / copied, "flops_per_s": 2 * terms * count * some.size / worked}
+        call, x = jax.jit(run), x[:worlds]
+        rates["issued_per_s"] = terms * count * worlds / least_seconds(lambda: jax.block_until_ready(call(x)), 5)
+    return rates
+
+
+#: Instructions of the machine that stand for one of PTX where it is not one.
+LONG = {"div.rn.f32": 8, "sqrt.rn.f32": 8, "rcp.rn.f32": 6}
+
+
+def instructions(model, state) -> int:
+    """Instructions of a step of one world: those of the innermost loop of the kernel's PTX."""
+    p, world = enter(model, with_memory(model, state), state.batch_shape)
+    once, n = _advance(model.structure, model.method), jnp.ones((1,), jnp.int32)
+    made = kernel.program(kernel._many(once), *state.batch_shape, n, world, p, None)[0]
+    lines = kernel.ptx(made.text, kernel.capability()).splitlines()
+    labels = {line.split(":")[0]: i for i, line in enumerate(lines) if line.startswith("$")}
+    branches = (
+        (labels[m[1]], i) for i, line in enumerate(lines) if (m := re.search(r"bra(?:\.uni)?\s+(\$\w+);", line))
+    )
+    first, last = min(((a, b) for a, b in branches if a < b), key=lambda loop: loop[1] - loop[0])
+    words = (re.sub(r"@!?%p\d+\s+", "", line.strip()).split() for line in lines[first : last + 1])
+    return sum(LONG.get(w[0], 1) for w in words if w and re.match(r"[a-z][\w.]*$", w[0]))
 
 
 @functools.cache
@@ -111,12 +133,11 @@ class Run:
             "status": int(np.asarray(self.program(self.model, self.state).status).max()),
         }  # fmt: skip
         if self.name in FREE:
-            step = jax.jit(lambda m, s: _rollout_batch(m, s, None, 1, 1)[0])
-            flops = counted(step.lower(self.model, with_memory(self.model, self.state)).compile())["flops"]
             moved = 2 * bytes_of(self.state._with(memory=None))
             row["bytes_share"] = 100 * moved / took / rates["bytes_per_s"]
-            row["flops_share"] = 100 * flops / took / rates["flops_per_s"]
-            row["flops"] = flops / self.size
+            if on_gpu() and not self.xla:
+                row["instructions"] = instructions(self.model, self.state)
+                row["issue_share"] = 100 * row["instructions"] * self.size / took / rates["issued_per_s"]
         return row
 
 
@@ -169,13 +190,13 @@ def report(env, rates, rows, wrong, rivals, took) -> str:
     for r in rows:
         if not r["xla"]:
             best[r["scene"]] = min(best.get(r["scene"], r), r, key=lambda r: r["ns"])
-        shares = [number(r.get(k)) for k in ("bytes_share", "flops_share")]
+        shares = [number(r.get(k)) for k in ("bytes_share", "issue_share")]
         name = throughput.TITLES[r["scene"]] + (", XLA's kernels" if r["xla"] else "")
         cells.append(
             [name, f"{r['size']:,}", number(r["ns"]), number(1e6 * r["step_s"]), number(1e9 / r["ns"]), *shares]
             + [r["kernels"], number(r["compile_s"]), r["status"] or ""]
         )
-    heads = ["scene", "worlds", "ns a world-step", "us a step", "world-steps/s", "% of bytes bound", "% of flops bound",
+    heads = ["scene", "worlds", "ns a world-step", "us a step", "world-steps/s", "% of bytes bound", "% of issue bound",
              "kernels of the program", "compile [s]", "status"]  # fmt: skip
     against = []
     for name in dict.fromkeys(r["scene"] for r in rivals):
@@ -190,18 +211,27 @@ def report(env, rates, rows, wrong, rivals, took) -> str:
         [throughput.TITLES[name], throughput.QUANTITIES[key], number(value["ours"]), number(value["mujoco"])]
         for name, found in wrong.items() for key, value in found.items() if isinstance(value, dict)
     ]  # fmt: skip
-    free = max((r["flops_share"] for r in rows if r["scene"] == "isotropic" and not r["xla"]), default=None)
+    free = max((r.get("issue_share", r["bytes_share"]) for r in rows if r["scene"] == "isotropic"), default=None)
+    counts = {r["scene"]: r["instructions"] for r in rows if "instructions" in r}
+    issued = rates.get("issued_per_s")
     return f"""# One device
 
 {common.header(env)} Device: {jax.devices()[0].device_kind}.
-Made by `benchmarks/accelerator.py` in {took:.0f} s. Measured: {rates["bytes_per_s"] / 1e9:.0f} GB/s,
-{rates["flops_per_s"] / 1e9:.0f} Gflop/s.
+Made by `benchmarks/accelerator.py` in {took:.0f} s. Bounds: {rates["bytes_per_s"] / 1e9:.0f} GB/s (a copy, measured){
+        ""
+        if issued is None
+        else f"; {issued / 1e9:.0f} billion instructions/s of threads ({rates.get('how', 'multiply-adds, measured')})"
+    }.
 
 {common.table(heads, cells)}
 
-The steps of a rollout are fused, so that arithmetic bounds them, not bytes (of which more than 100 % are the sign): a
-division or a root counts as one flop here, though it takes eight instructions and more. Isotropic free bodies reach
-{number(free)} % of that bound (bar {BOUND_BAR:g}: {verdict(free, BOUND_BAR, least=True)}).
+The steps of a rollout are fused, so that a device can do more of them than it could if every step read and wrote the
+state (shares above 100 % of the bytes bound); what then bounds them are the instructions that its threads can issue. A
+step has {
+        ", ".join(f"{n} ({throughput.TITLES[name]})" for name, n in counts.items()) or "(counted on a GPU)"
+    } of them in
+PTX, a division or root taken for 8. Isotropic free bodies reach {number(free)} % of the bound that applies (bar
+{BOUND_BAR:g}: {verdict(free, BOUND_BAR, least=True)}).
 
 ## Error at that speed
 
