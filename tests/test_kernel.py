@@ -94,7 +94,7 @@ def test_operations_that_move_elements(run_c):
         out += [c.sum(0), c.max(1), c.min((0, 1)), (c > 0).any(0), (c > -1).all((0, 1)), c.prod(1)]
         out += [jnp.take_along_axis(b, jnp.minimum(at, 7), 0), b[:, 0][at], jnp.take(b[:, 0], at, mode="fill")]
         out += [jnp.take_along_axis(c, at[None] % 5, 1)[:, ::2], jnp.arange(8.0)[:, None] * b]
-        return out + jnp.split(c, [2, 3], axis=1)
+        return out + [jnp.stack([a, 2 * a], 1), *jnp.split(c, [2, 3], axis=1)]
 
     agree(run_c, f, a, b, c, at)
 

@@ -348,7 +348,7 @@ class Scope:
             self.env[op.outs[0]] = self._view(op)
         elif op.name in _REDUCTIONS:
             self._reduce(op)
-        elif op.name in ("concatenate", "pad", "split"):
+        elif op.name in ("concatenate", "pad", "split", "stack"):
             getattr(self, "_" + op.name)(op)
         elif op.name == "dynamic_update_slice":
             self._update(i, op)
@@ -581,6 +581,20 @@ class Scope:
             if v.size:
                 self.e.loop(v.size, put)
             start += v.shape[axis]
+
+    def _stack(self, op: Op) -> None:
+        (out,) = op.outs
+        parts = [self.value(v) for v in op.ins]
+        target = self._hold(out, self.e.declare(out.dtype, out.size))
+        axis = op.params["axis"]
+        for j, (v, part) in enumerate(zip(op.ins, parts)):
+
+            def put(k, v=v, part=part, j=j):
+                d = _digits(k, v.shape)
+                d.insert(axis, str(j))
+                self.e.line(f"{target.at(_flat(d, out.shape))} = {part.at(k)};")
+
+            self.e.loop(v.size, put)
 
     def _pad(self, op: Op) -> None:
         source, filler = op.ins
