@@ -200,8 +200,18 @@ STEPS = 12
 
 
 @on_cpu
-@pytest.mark.parametrize("local", [True, False], ids=["local", "buffer"])
-@pytest.mark.parametrize("name", ["top", "ball", "box", "column", "heap", "mixed"])
+@pytest.mark.parametrize(
+    "name, local",
+    [
+        ("top", True),
+        ("ball", True),
+        ("box", True),
+        ("heap", True),
+        ("heap", False),
+        ("column", False),
+        ("mixed", False),
+    ],
+)
 def test_scenes_move_as_on_the_cpu(run_c, monkeypatch, name, local):
     if not local:
         monkeypatch.setattr(emit, "LOCAL", 0)
@@ -263,6 +273,26 @@ def test_what_cannot_be_a_kernel_is_said_and_runs_without(as_if_gpu, monkeypatch
     model, state = built("ball")
     with pytest.warns(UserWarning, match="NVRTC was not found"):
         assert calls(_step, model, state, None) == 0
+
+
+def test_ptx_is_kept_beside_the_compilation_cache(tmp_path, monkeypatch):
+    runs = []
+    monkeypatch.setattr(nvrtc, "compiled", lambda text, capability: runs.append(text) or f"// {text} for {capability}")
+    before = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path / "cache"))
+    try:
+        for _ in range(3):
+            nvrtc.ptx.cache_clear()  # as another process would
+            assert nvrtc.ptx("a", "9.0") == "// a for 9.0"
+        assert nvrtc.ptx("a", "8.0") == "// a for 8.0"
+        assert runs == ["a", "a"]
+        jax.config.update("jax_compilation_cache_dir", str(tmp_path / "cache" / next((tmp_path / "cache").iterdir())))
+        nvrtc.ptx.cache_clear()
+        with pytest.warns(UserWarning, match="was not written"):
+            assert nvrtc.ptx("b", "9.0") == "// b for 9.0"
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
+        nvrtc.ptx.cache_clear()
 
 
 @on_gpu

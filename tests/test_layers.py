@@ -51,6 +51,7 @@ LAYER = {
 }
 #: Inside one layer: who may import whom.
 WITHIN = {
+    ("loops", "xla"),
     ("model", "method"),
     ("step", "detect"),
     ("step", "events"),

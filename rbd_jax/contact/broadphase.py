@@ -23,9 +23,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..loops import only_if, repeat, write
 from ..spatial import Vec3
 from ..struct import struct
-from ..xla import summed
+from ..xla import largest, summed
 from .base import Pose
 
 #: Gap, as a part of the smaller geom's size, up to which its points count as contact.
@@ -159,6 +160,9 @@ def lookup_of_one(pairs: jax.Array, previous: jax.Array, filled: jax.Array) -> j
 
 # --- the searches ---
 
+#: Words of which it is asked at once whether they have a bit.
+TOGETHER = 16
+
 
 def _words(a: Bounds, b: Bounds, balls: bool, allowed: np.ndarray | None) -> jax.Array:
     """uint32 (count_a / 32, count_b, B): 32 geoms of side A to a word, a bit where the pair is close."""
@@ -203,21 +207,28 @@ def pairs_of_one(a: Bounds, b: Bounds, balls: bool, allowed: np.ndarray | None, 
     """As ``all_pairs``, of one world and for a program that is one function of the CPU (``xla.one_function``)."""
     word = _words(a, b, balls, allowed)[..., 0].ravel()
     none = no_key(len(a), len(b))
+    count_words = len(word)
+    word = jnp.pad(word, (0, -count_words % TOGETHER))
+    some = largest(word.reshape(-1, TOGETHER), 1) != 0
 
-    def step(carry):
-        k, left, count, keys = carry
-        bit = jax.lax.population_count((left & (~left + 1)) - 1).astype(jnp.int32)
-        key = jnp.where(left == 0, none, k * WORD + bit)[None, None]
-        # written where the next one goes; it stays only if there was a bit
-        keys = jax.lax.dynamic_update_slice(keys, key, (jnp.minimum(count, capacity), jnp.int32(0)))
-        count = count + (left != 0)
-        left = left & (left - 1)
-        on = left == 0
-        k = k + on
-        return k, jnp.where(on, word[jnp.minimum(k, len(word) - 1)], left), count, keys
+    def of_word(k, carry):
+        left = word[k]
 
-    start = (jnp.int32(0), word[0], jnp.int32(0), jnp.full((capacity + 1, 1), none, jnp.int32))
-    _, _, count, keys = jax.lax.while_loop(lambda c: c[0] < len(word), step, start)
+        def step(carry):
+            left, count, keys = carry
+            bit = jax.lax.population_count((left & (~left + 1)) - 1).astype(jnp.int32)
+            keys = write(keys, jnp.minimum(count, capacity), (k * WORD + bit)[None])
+            return left & (left - 1), count + 1, keys
+
+        return jax.lax.while_loop(lambda c: c[0] != 0, step, (left, *carry))[1:]
+
+    def of_words(k, carry):
+        each = lambda carry: repeat(k * TOGETHER, (k + 1) * TOGETHER, of_word, carry)
+        return only_if(some[k].astype(jnp.int32), each, carry)
+
+    start = (jnp.int32(0), jnp.full(capacity + 1, none, jnp.int32))
+    count, keys = repeat(0, len(some), of_words, start)
+    keys = jnp.where(jnp.arange(capacity + 1) < count, keys, none)[:, None]
     return keys[:capacity], count[None] > capacity
 
 

@@ -5,8 +5,13 @@ from __future__ import annotations
 import ctypes
 import ctypes.util
 import functools
+import hashlib
 import importlib.util
+import os
 import pathlib
+import warnings
+
+import jax
 
 
 class CompileError(RuntimeError):
@@ -34,11 +39,41 @@ def _packaged():
 
 @functools.lru_cache(maxsize=64)
 def ptx(text: str, capability: str) -> str:
-    """The PTX of a program for a GPU of this compute capability ("9.0").
+    """The PTX of a program for a GPU of this compute capability ("9.0"); JAX's persistent cache keeps it too.
 
     Raises:
       CompileError: there is no NVRTC, or it refuses the program.
     """
+    folder = jax.config.jax_compilation_cache_dir
+    if not folder or "://" in folder:
+        return compiled(text, capability)
+    key = hashlib.sha256(f"{version()} {capability} {text}".encode()).hexdigest()
+    path = pathlib.Path(folder) / f"rbd_jax-{key}.ptx"
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError:
+        code = compiled(text, capability)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        aside = path.with_suffix(f".{os.getpid()}")
+        aside.write_text(code, encoding="utf-8")
+        aside.replace(path)
+    except OSError as reason:  # a cache that cannot be written is none
+        warnings.warn(f"{path} was not written: {reason}", stacklevel=2)
+    return code
+
+
+@functools.cache
+def version() -> tuple[int, int]:
+    """NVRTC's version, (0, 0) where there is none."""
+    nvrtc, numbers = library(), (ctypes.c_int(), ctypes.c_int())
+    if nvrtc is not None:
+        _check(nvrtc, nvrtc.nvrtcVersion(*map(ctypes.byref, numbers)))
+    return tuple(n.value for n in numbers)
+
+
+def compiled(text: str, capability: str) -> str:
+    """As ``ptx``, compiled now."""
     nvrtc = library()
     if nvrtc is None:
         raise CompileError("NVRTC was not found")
