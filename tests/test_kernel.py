@@ -21,7 +21,11 @@ from rbd_jax.xla import unset
 
 COMPILER = shutil.which("g++") or shutil.which("c++")
 on_cpu = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler")
-on_gpu = pytest.mark.skipif(jax.default_backend() != "gpu", reason="no GPU")
+no_gpu = pytest.mark.skipif(jax.default_backend() != "gpu", reason="no GPU")
+
+
+def on_gpu(test):
+    return pytest.mark.gpu(no_gpu(test))
 
 
 @pytest.fixture
