@@ -32,12 +32,11 @@ import throughput  # noqa: E402
 from common import least_seconds, number  # noqa: E402
 
 import rbd_jax as rbd  # noqa: E402
-from rbd_jax.kernel.flat import flatten  # noqa: E402
+from rbd_jax import kernel  # noqa: E402
 from rbd_jax.memory import bytes_of  # noqa: E402
 from rbd_jax.rollout import _rollout_batch  # noqa: E402
 from rbd_jax.step import advance, enter, with_memory  # noqa: E402
 from rbd_jax.tiles import TILE  # noqa: E402
-from rbd_jax.xla import lean, traced_for_a_thread  # noqa: E402
 
 SCENES = ("ball", "isotropic", "asymmetric", "box", "stack", "clutter", "pile16", "pile64")
 KERNELS = 5  # of a scene that are listed
@@ -76,10 +75,7 @@ FREE_OF_CHARGE = frozenset("and or not xor select_n convert_element_type is_fini
 def arithmetic(model, state) -> int | None:
     """Arithmetic operations of a step of one world, each once; None where loops decide how many there are."""
     p, world = enter(model, with_memory(model, state), state.batch_shape)
-    one = lambda c: c[..., :1] if c.ndim else c
-    with traced_for_a_thread():
-        traced = jax.make_jaxpr(lambda p, w: advance(model, p, w, None))(*jax.tree.map(one, (p, world)))
-    ops = flatten(lean(traced.jaxpr)[0], traced.consts).ops
+    ops = kernel.operations(lambda p, world: advance(model, p, world, None), *state.batch_shape, p, world)
     if any(op.bodies for op in ops):
         return None
     real = (op for op in ops if op.name not in FREE_OF_CHARGE and np.dtype(op.outs[0].dtype).kind == "f")

@@ -27,7 +27,7 @@ from .contact.broadphase import (
     pairs_of_one,
     rows_of_key,
 )
-from .loops import BLOCK, Listed, each_pair, in_blocks, listed, repeat
+from .loops import BLOCK, Listed, block_of, each_pair, in_blocks, listed, repeat
 from .model import Coefficient, Group, GroupParams, Params, Structure
 from .solvers.rows import Impulses, Index, Rows, take, take_tree
 from .spatial import Quat, Vec3, safe_norm
@@ -290,7 +290,7 @@ def _group(
             margin = selected.numbers.law.margin
         return manifold(g, selected, world, margin, one)
 
-    if in_one_function() and world.step.shape == (1,) and pairs is not None:
+    if alone and pairs is not None:
         count = below(pairs, jnp.full((1, 1), no_key(len(g.choice.a), len(g.choice.b)), jnp.int32))[0, 0]
         before = lookup_of_one(pairs, world.pairs[number], count)
         return _in_blocks_of(g, p, world, number, looked_at, narrow, (pairs, before), count)._with(
@@ -354,7 +354,7 @@ def _in_blocks_of(g, p, world, number, looked_at, narrow, listed, count) -> Cont
 
 def _width(g: Group) -> int:
     """Pairs of a block: fewer where each costs more."""
-    return 1 if g.kind == ("box", "box") or in_a_thread() else max(BLOCK // g.slots, 1)
+    return block_of(1 if g.kind == ("box", "box") else max(BLOCK // g.slots, 1))
 
 
 def of_places(contact: Contact, x):

@@ -106,6 +106,11 @@ def each_pair(f, matters, *args):
 BLOCK = 16
 
 
+def block_of(width: int) -> int:
+    """Pairs of a block that may be so wide: one in a thread, which has no vectors."""
+    return 1 if in_a_thread() else width
+
+
 def in_blocks(f, filled: jax.Array | None, *args, width: int = BLOCK):
     """``f(*args)``, trees of arrays (..., P, B), of the first ``filled`` pairs, block by block; any values behind them.
 
@@ -114,7 +119,7 @@ def in_blocks(f, filled: jax.Array | None, *args, width: int = BLOCK):
     if filled is None:
         return f(*args)
     pairs = max(c.shape[-2] for c in jax.tree.leaves(args))
-    width = 1 if in_a_thread() else min(width, pairs)
+    width = block_of(min(width, pairs))
     worlds = max(c.shape[-1] for c in jax.tree.leaves(args))
 
     def wide(*args):  # what is the same for all pairs, or all worlds, too

@@ -286,21 +286,19 @@ def _loop(model, state, batch, wrench, steps, every, ask, blocks, truncate, nudg
         """``count`` steps."""
         while blocks and blocks[0] >= count:
             blocks = blocks[1:]
-        if ask is None and cuts is None and not blocks:
-            return repeated(
-                _advance(model.structure, model.method), world, p, hot, worlds=math.prod(batch), count=count
-            ), None
-        if not blocks:
-            return jax.lax.scan(one_step, world, cuts, length=count)[0], None
-        return _in_blocks(run, world, cuts, count, blocks[0], blocks[1:])
+        if blocks:
+            return _in_blocks(run, world, cuts, count, blocks[0], blocks[1:])
+        if ask is None and cuts is None:
+            once = _advance(model.structure, model.method)
+            return repeated(once, world, p, hot, worlds=math.prod(batch), count=count), None
+        if count == 1:
+            return one_step(world, None if cuts is None else cuts[0])
+        return jax.lax.scan(one_step, world, cuts, length=count)[0], None
 
     def interval(world, x, blocks):
         """The steps to the next sample."""
         cuts, change = x
-        if every == 1 and (ask is not None or cuts is not None):
-            world = one_step(world, None if cuts is None else cuts[0])[0]
-        else:
-            world = run(world, cuts, every, blocks)[0]
+        world = run(world, cuts, every, blocks)[0]
         if nudge is not None:
             world = nudge[0](p, world, change)
         return world, _sample(model, p, world)

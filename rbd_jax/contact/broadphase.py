@@ -207,8 +207,7 @@ def pairs_of_one(a: Bounds, b: Bounds, balls: bool, allowed: np.ndarray | None, 
     """As ``all_pairs``, of one world and for a program that is one function of the CPU (``xla.one_function``)."""
     word = _words(a, b, balls, allowed)[..., 0].ravel()
     none = no_key(len(a), len(b))
-    count_words = len(word)
-    word = jnp.pad(word, (0, -count_words % TOGETHER))
+    word = jnp.pad(word, (0, -len(word) % TOGETHER))
     some = largest(word.reshape(-1, TOGETHER), 1) != 0
 
     def of_word(k, carry):
@@ -217,6 +216,7 @@ def pairs_of_one(a: Bounds, b: Bounds, balls: bool, allowed: np.ndarray | None, 
         def step(carry):
             left, count, keys = carry
             bit = jax.lax.population_count((left & (~left + 1)) - 1).astype(jnp.int32)
+            # what is one too many is written behind the others
             keys = write(keys, jnp.minimum(count, capacity), (k * WORD + bit)[None])
             return left & (left - 1), count + 1, keys
 
@@ -228,8 +228,7 @@ def pairs_of_one(a: Bounds, b: Bounds, balls: bool, allowed: np.ndarray | None, 
 
     start = (jnp.int32(0), jnp.full(capacity + 1, none, jnp.int32))
     count, keys = repeat(0, len(some), of_words, start)
-    keys = jnp.where(jnp.arange(capacity + 1) < count, keys, none)[:, None]
-    return keys[:capacity], count[None] > capacity
+    return keys[:capacity, None], count[None] > capacity
 
 
 def grid_pairs(a: Bounds, b: Bounds | None, balls: bool, allowed: np.ndarray | None, capacity: int, candidates: int):

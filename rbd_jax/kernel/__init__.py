@@ -22,7 +22,7 @@ import numpy as np
 from ..loops import repeat
 from ..xla import lean, on_gpu, traced_for_a_thread
 from .emit import Leaf, source
-from .flat import Unsupported, flatten
+from .flat import Op, Unsupported, flatten
 from .nvrtc import CompileError, ptx
 
 _forward = contextvars.ContextVar("forward", default=False)
@@ -71,23 +71,39 @@ def program(run, worlds: int, *args):
     Raises:
       Unsupported: it has no place in one kernel.
     """
-    leaves, tree = jax.tree.flatten(args)
-    own = [bool(jnp.ndim(c)) and jnp.shape(c)[-1] == worlds for c in leaves]
-    one = [((*jnp.shape(c)[:-1], 1) if o else jnp.shape(c), jnp.result_type(c)) for c, o in zip(leaves, own)]
-    return _program(run, tree, tuple(one), tuple(own))
+    return _program(run, *_of_one(worlds, args))
 
 
 @functools.lru_cache(maxsize=64)
 def _program(run, tree, one, own):
-    shapes = [jax.ShapeDtypeStruct(*c) for c in one]
+    flat, used, shape = _traced(run, tree, one)
+    arguments = [Leaf(math.prod(c.shape), c.dtype.name, o) for c, o, u in zip(one, own, used, strict=True) if u]
+    results = [Leaf(math.prod(c.shape), c.dtype.name, True) for c in jax.tree.leaves(shape)]
+    return source(flat, arguments, results, NAME), used, shape
+
+
+def operations(run, worlds: int, *args) -> list[Op]:
+    """What ``run`` does for one world, operation by operation."""
+    tree, one, _ = _of_one(worlds, args)
+    return _traced(run, tree, one)[0].ops
+
+
+def _of_one(worlds: int, args):
+    """The arguments of one world: their tree, shapes, and which of them every world has for itself."""
+    leaves, tree = jax.tree.flatten(args)
+    own = tuple(bool(jnp.ndim(c)) and jnp.shape(c)[-1] == worlds for c in leaves)
+    shape = lambda c, o: (*jnp.shape(c)[:-1], 1) if o else jnp.shape(c)
+    one = tuple(jax.ShapeDtypeStruct(shape(c, o), jnp.result_type(c)) for c, o in zip(leaves, own))
+    return tree, one, own
+
+
+def _traced(run, tree, one):
     with traced_for_a_thread():
-        traced, shape = jax.make_jaxpr(run, return_shape=True)(*tree.unflatten(shapes))
+        traced, shape = jax.make_jaxpr(run, return_shape=True)(*tree.unflatten(one))
     if any(isinstance(c, jax.core.Tracer) for c in traced.consts):
         raise Unsupported("it closes over a traced value")
     short, used = lean(traced.jaxpr)
-    arguments = [Leaf(math.prod(c.shape), c.dtype.name, o) for c, o, u in zip(shapes, own, used, strict=True) if u]
-    results = [Leaf(math.prod(c.shape), c.dtype.name, True) for c in jax.tree.leaves(shape)]
-    return source(flatten(short, traced.consts), arguments, results, NAME), used, shape
+    return flatten(short, traced.consts), used, shape
 
 
 @functools.lru_cache(maxsize=64)

@@ -20,7 +20,7 @@ from .operations import PRELUDE, expression, literal, type_of
 #: Loops over no more elements are written out by the compiler, so that their arrays can live in registers.
 UNROLLED = 16
 #: Bytes of arrays in a thread's own memory: all threads that a GPU can hold get so much at once, 17 GB of an H100. With
-#: more they are in a buffer for the threads that are started, which then are no more than those of ``program``.
+#: more they are in a buffer for the threads that are started.
 LOCAL = 64 * 1024
 #: Bytes of arrays of a thread at most.
 MEMORY = 1024 * 1024
@@ -274,7 +274,7 @@ class Scope:
     def value(self, v) -> Array:
         v = whole(v)
         if isinstance(v, Constant):
-            return self.e.constant(v.value)
+            return self.e.constant(v.array)
         if v in self.waits:
             self.flush(self.waits[v])
         return self.env[v]
@@ -371,9 +371,7 @@ class Scope:
             if isinstance(v, Var) and v in self.waits and (self.waits[v] != out.size or elsewhere):
                 self.flush(self.waits[v])
         if out.size == 1:
-            name = self.e.name()
-            self.e.line(f"const {type_of(out.dtype)} {name} = {self._element(op, '0', {})};")
-            self.env[out] = Array(lambda k: name, 1)
+            self.env[out] = self._read(out, self._element(op, "0", {}))
             return
         self.waiting.setdefault(out.size, []).append(i)
         self.waits[out] = out.size
@@ -404,8 +402,6 @@ class Scope:
             return self._read(out, base.at(_flat(digits("0"), shape)))
         if source.size == 1:
             return Array(lambda k: base.at("0"), out.size)
-        if op.name == "broadcast_in_dim" and out.size == source.size:
-            return Array(base.at, out.size, root=base.root or base)
         return Array(lambda k: base.at(_flat(digits(k), shape)), out.size, root=base.root or base)
 
     def _read(self, out: Var, text: str) -> Array:
@@ -443,12 +439,16 @@ class Scope:
             return
         target = self._owned(i, old, source, op)
         self._hold(out, target)
+        self._put(target, old.shape, values, new.shape, lambda d: [_plus(x, s) for x, s in zip(d, where)])
 
-        def put(k):
-            digits = [_plus(d, s) for d, s in zip(_digits(k, new.shape), where)]
-            self.e.line(f"{target.at(_flat(digits, old.shape))} = {values.at(k)};")
+    def _put(self, target: Array, shape, part: Array, of, place) -> None:
+        """Copy ``part`` of shape ``of`` into ``target``: its element of indices d to that of indices place(d)."""
 
-        self.e.loop(new.size, put)
+        def one(k):
+            self.e.line(f"{target.at(_flat(place(_digits(k, of)), shape))} = {part.at(k)};")
+
+        if part.size:
+            self.e.loop(part.size, one)
 
     def _owned(self, i: int, v, source: Array, op: Op) -> Array:
         """The memory of ``v`` if it may be changed at operation i, else a copy."""
@@ -567,34 +567,21 @@ class Scope:
         self.e.loop(out.size, over)
 
     def _concatenate(self, op: Op) -> None:
-        (out,) = op.outs
-        parts = [self.value(v) for v in op.ins]
-        target = self._hold(out, self.e.declare(out.dtype, out.size))
-        axis, start = op.params["dimension"], 0
-        for v, part in zip(op.ins, parts):
-
-            def put(k, v=v, part=part, start=start):
-                d = _digits(k, v.shape)
-                d[axis] = _plus(d[axis], start)
-                self.e.line(f"{target.at(_flat(d, out.shape))} = {part.at(k)};")
-
-            if v.size:
-                self.e.loop(v.size, put)
-            start += v.shape[axis]
+        axis = op.params["dimension"]
+        starts = itertools.accumulate((v.shape[axis] for v in op.ins), initial=0)
+        self._join(op, [lambda d, s=s: [*d[:axis], _plus(d[axis], s), *d[axis + 1 :]] for s in starts])
 
     def _stack(self, op: Op) -> None:
+        axis = op.params["axis"]
+        self._join(op, [lambda d, j=j: [*d[:axis], str(j), *d[axis:]] for j in range(len(op.ins))])
+
+    def _join(self, op: Op, places) -> None:
+        """A new array of all operands, each with its ``place``, see ``_put``."""
         (out,) = op.outs
         parts = [self.value(v) for v in op.ins]
         target = self._hold(out, self.e.declare(out.dtype, out.size))
-        axis = op.params["axis"]
-        for j, (v, part) in enumerate(zip(op.ins, parts)):
-
-            def put(k, v=v, part=part, j=j):
-                d = _digits(k, v.shape)
-                d.insert(axis, str(j))
-                self.e.line(f"{target.at(_flat(d, out.shape))} = {part.at(k)};")
-
-            self.e.loop(v.size, put)
+        for v, part, place in zip(op.ins, parts, places):
+            self._put(target, out.shape, part, v.shape, place)
 
     def _pad(self, op: Op) -> None:
         source, filler = op.ins
@@ -605,13 +592,7 @@ class Scope:
         base, fill = self.value(source), self.value(filler)
         target = self._hold(out, self.e.declare(out.dtype, out.size))
         self.e.loop(out.size, lambda k: self.e.line(f"{target.at(k)} = {fill.at('0')};"))
-
-        def put(k):
-            d = [_plus(x, c[0]) for x, c in zip(_digits(k, source.shape), config)]
-            self.e.line(f"{target.at(_flat(d, out.shape))} = {base.at(k)};")
-
-        if source.size:
-            self.e.loop(source.size, put)
+        self._put(target, out.shape, base, source.shape, lambda d: [_plus(x, c[0]) for x, c in zip(d, config)])
 
     def _split(self, op: Op) -> None:
         source, axis, start = op.ins[0], op.params["axis"], 0

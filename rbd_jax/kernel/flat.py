@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import jax
 import jax.numpy as jnp
@@ -28,33 +29,45 @@ class Unsupported(Exception):
     """A program cannot become one kernel; the text says for which operation."""
 
 
-class Var:
-    """A value: its shape and dtype."""
+class Value:
+    """What an operation takes or gives: its shape and dtype."""
 
-    __slots__ = ("dtype", "shape", "size")
-
-    def __init__(self, aval):
-        self.shape, self.dtype = tuple(aval.shape), np.dtype(aval.dtype)
-        self.size = int(np.prod(self.shape, dtype=np.int64))
+    def __init__(self, shape, dtype):
+        self.shape, self.dtype = tuple(shape), np.dtype(dtype)
+        self.size = math.prod(self.shape)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Constant:
+class Var(Value):
+    """A value that is computed."""
+
+
+class Constant(Value):
     """An array known in advance."""
 
-    value: np.ndarray
+    def __init__(self, array: np.ndarray):
+        super().__init__(array.shape, array.dtype)
+        self.array = array
 
-    @property
-    def shape(self):
-        return self.value.shape
 
-    @property
-    def dtype(self):
-        return self.value.dtype
+class Renamed(Value):
+    """The elements of a variable in another shape."""
 
-    @property
-    def size(self):
-        return self.value.size
+    def __init__(self, shape, var: Var):
+        super().__init__(shape, var.dtype)
+        self.var = var
+
+
+def whole(value: Value) -> Var | Constant:
+    """The variable or constant behind a value."""
+    return value.var if isinstance(value, Renamed) else value
+
+
+def renamed(value: Value, shape) -> Value:
+    """The elements of a value in this shape."""
+    value, shape = whole(value), tuple(shape)
+    if isinstance(value, Constant):
+        return Constant(value.array.reshape(shape))
+    return value if value.shape == shape else Renamed(shape, value)
 
 
 @dataclasses.dataclass(eq=False)
@@ -62,7 +75,7 @@ class Op:
     """One operation. bodies: flat programs of a loop or condition."""
 
     name: str
-    ins: list[Var | Constant]
+    ins: list[Value]
     outs: list[Var]
     params: dict
     bodies: tuple[Flat, ...] = ()
@@ -74,7 +87,7 @@ class Flat:
 
     ins: list[Var]
     ops: list[Op]
-    outs: list[Var | Constant]
+    outs: list[Value]
 
 
 def flatten(jaxpr, consts=(), given=()) -> Flat:
@@ -84,7 +97,7 @@ def flatten(jaxpr, consts=(), given=()) -> Flat:
       Unsupported: an operation calls others in a way that is not known.
     """
     env: dict = {}
-    ins = [Var(v.aval) for v in jaxpr.invars]
+    ins = [_var(v) for v in jaxpr.invars]
     env.update(zip(jaxpr.invars, ins))
     env.update((v, c) for v, c in zip(jaxpr.invars, given) if isinstance(c, Constant))
     env.update(zip(jaxpr.constvars, (Constant(np.asarray(c)) for c in consts)))
@@ -93,7 +106,11 @@ def flatten(jaxpr, consts=(), given=()) -> Flat:
     return Flat(ins, ops, [_value(env, v) for v in jaxpr.outvars])
 
 
-def _value(env, v):
+def _var(v) -> Var:
+    return Var(v.aval.shape, v.aval.dtype)
+
+
+def _value(env, v) -> Value:
     return Constant(np.asarray(v.val, v.aval.dtype)) if hasattr(v, "val") else env[v]
 
 
@@ -109,19 +126,16 @@ def _inline(jaxpr, env, ops: list[Op]) -> None:
             _inline(inner, own, ops)
             env.update(zip(e.outvars, (_value(own, v) for v in inner.outvars)))
         elif _same(e, ins):
-            same = ins[0]
             if e.params.get("dimensions") and name == "reshape":
                 raise Unsupported("reshape with dimensions")
-            if isinstance(same, Constant):
-                same = Constant(np.reshape(same.value, e.outvars[0].aval.shape))
-            env[e.outvars[0]] = _Renamed(same, e.outvars[0].aval)
+            env[e.outvars[0]] = renamed(ins[0], e.outvars[0].aval.shape)
         elif name not in LOOPS and ins and all(isinstance(v, Constant) for v in ins):
             with jax.ensure_compile_time_eval():
-                known = e.primitive.bind(*(jnp.asarray(v.value) for v in ins), **e.params)
+                known = e.primitive.bind(*(jnp.asarray(v.array) for v in ins), **e.params)
             known = known if e.primitive.multiple_results else [known]
             env.update(zip(e.outvars, (Constant(np.asarray(c)) for c in known)))
         else:
-            outs = [Var(v.aval) for v in e.outvars]
+            outs = [_var(v) for v in e.outvars]
             env.update(zip(e.outvars, outs))
             ops.append(Op(name, ins, outs, e.params, _bodies(name, ins, e.params)))
 
@@ -137,34 +151,6 @@ def _same(e, ins) -> bool:
         order = [j for j in e.params["permutation"] if ins[0].shape[j] != 1]
         return order == sorted(order)
     return name in SAME_IF_WHOLE and out.aval.size == ins[0].size
-
-
-class _Renamed:
-    """The elements of a value in another shape."""
-
-    __slots__ = ("shape", "value")
-
-    def __new__(cls, value, aval):
-        if isinstance(value, _Renamed):
-            value = value.value
-        if isinstance(value, Constant) or value.shape == tuple(aval.shape):
-            return value
-        self = super().__new__(cls)
-        self.value, self.shape = value, tuple(aval.shape)
-        return self
-
-    @property
-    def dtype(self):
-        return self.value.dtype
-
-    @property
-    def size(self):
-        return self.value.size
-
-
-def whole(value):
-    """The variable or constant behind a value."""
-    return value.value if isinstance(value, _Renamed) else value
 
 
 def _bodies(name: str, ins, params) -> tuple[Flat, ...]:
