@@ -34,7 +34,7 @@ from common import MuJoCo, Program, least_seconds, number, verdict  # noqa: E402
 import rbd_jax as rbd  # noqa: E402
 from rbd_jax import kernel  # noqa: E402
 from rbd_jax.memory import bytes_of  # noqa: E402
-from rbd_jax.rollout import _advance, _rollout_batch  # noqa: E402
+from rbd_jax.rollout import Length, _advance, _rollout_batch  # noqa: E402
 from rbd_jax.step import enter, with_memory  # noqa: E402
 from rbd_jax.xla import on_gpu  # noqa: E402
 
@@ -121,7 +121,7 @@ class Run:
     def compile(self):
         self.model, self.state = start(self.name, self.size)
         steps = self.steps
-        bare = lambda m, s: _rollout_batch(m, with_memory(m, s), None, steps, steps)[0]
+        bare = lambda m, s: _rollout_batch(m, with_memory(m, s), None, Length.of(steps, steps))[0]
         self.program = Program(bare if self.xla else throughput.last(steps), self.model, self.state)
 
     def row(self, args, rates) -> dict:

@@ -34,7 +34,7 @@ from common import least_seconds, number  # noqa: E402
 import rbd_jax as rbd  # noqa: E402
 from rbd_jax import kernel  # noqa: E402
 from rbd_jax.memory import bytes_of  # noqa: E402
-from rbd_jax.rollout import _rollout_batch  # noqa: E402
+from rbd_jax.rollout import Length, _rollout_batch  # noqa: E402
 from rbd_jax.step import advance, enter, with_memory  # noqa: E402
 from rbd_jax.tiles import TILE  # noqa: E402
 
@@ -120,9 +120,9 @@ def measure(name, args) -> dict:
     state = worlds(one, size, np.random.default_rng(1))
     whole = jax.jit(lambda m, s: rbd.rollout(m, s, steps, every=steps)[0])
     single = whole.lower(model, state).compile()
-    kernels = jax.jit(lambda m, s: _rollout_batch(m, with_memory(m, s), None, steps, steps)[0])
+    kernels = jax.jit(lambda m, s: _rollout_batch(m, with_memory(m, s), None, Length.of(steps, steps))[0])
     split = kernels.lower(model, state).compile()
-    step = jax.jit(lambda m, s: _rollout_batch(m, s, None, 1, 1)[0])
+    step = jax.jit(lambda m, s: _rollout_batch(m, s, None, Length.of(1, 1))[0])
     warm = with_memory(model, state)
     cost = counted(step.lower(model, warm).compile())
     longest, launches = profile(split, (model, state), steps)

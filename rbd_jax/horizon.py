@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from .checks import whole
 from .model import Model, Params, batch_of
-from .rollout import _check_state, _check_wrench, _rollout_batch, asked, blocks_of
+from .rollout import Length, _check_state, _check_wrench, _rollout_batch, asked, blocks_of
 from .spatial import Vec3, components, qexp
 from .state import State, World
 from .step import with_memory
@@ -85,7 +85,8 @@ def _norms(model, state, wrench, steps, every, objective, control, blocks) -> Gr
         ask, wrench = asked(model, state, control)
 
     def value(changes):
-        final, _ = _rollout_batch(model, state, wrench, steps, every, ask, blocks, safe=True, nudge=(nudged, changes))
+        length, nudge = Length.of(steps, every), (nudged, changes)
+        final, _ = _rollout_batch(model, state, wrench, length, ask, blocks, safe=True, nudge=nudge)
         J = jnp.asarray(objective(final))
         if J.shape not in ((), batch) or not jnp.issubdtype(J.dtype, jnp.floating):
             raise ValueError(

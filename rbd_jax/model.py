@@ -311,7 +311,10 @@ class GroupParams:
 
 @struct
 class Params:
-    """The numbers of a model in the hot layout: (n, 1), or (n, B) where a leaf has batch axes."""
+    """The numbers of a model in the hot layout: (n, 1), or (n, B) where a leaf has batch axes.
+
+    h: length of a substep; substeps: of a step, where that is no part of the program (int32), else None.
+    """
 
     h: jax.Array
     mass: jax.Array
@@ -324,6 +327,7 @@ class Params:
     com: Vec3 | None = None
     principal: Quat | None = None
     smoothing: tuple | None = None
+    substeps: jax.Array | None = None
 
 
 def leaf(model: Model, name: str, batch: tuple[int, ...]) -> jax.Array | None:
@@ -372,12 +376,17 @@ def batch_of(model: Model, batch: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(batch)
 
 
-def params(model: Model, batch: tuple[int, ...], one: jax.Array) -> Params:
-    """The hot numbers of a model for worlds with batch axes ``batch``."""
+def params(model: Model, batch: tuple[int, ...], one: jax.Array, substeps: jax.Array | None = None) -> Params:
+    """The hot numbers of a model for worlds with batch axes ``batch``.
+
+    substeps: traced, of a method that leaves them open (``Method.substeps`` None).
+    """
     s = model.structure
     get = lambda name: leaf(model, name, batch)
     h = get("dt")[0] if model.dt.ndim == 0 else get("dt")
-    h = h / model.method.substeps
+    parts = model.method.substeps if substeps is None else substeps.astype(h.dtype)
+    if substeps is not None or parts > 1:  # by a constant XLA would multiply with the reciprocal, which rounds twice
+        h = h / (parts * one)
     mass = get("mass")
     inertia = None
     if s.attitude:
@@ -399,6 +408,7 @@ def params(model: Model, batch: tuple[int, ...], one: jax.Array) -> Params:
         com=None if model.com is None else _vec3(get("com")),
         principal=_principal(model, get),
         smoothing=None if smoothing is None else (smoothing[0], smoothing[1]),
+        substeps=substeps,
     )
 
 

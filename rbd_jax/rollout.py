@@ -9,9 +9,11 @@ are lost from the start are replaced by harmless ones. Its values are those of t
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 import types
+import typing
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +24,7 @@ from .kernel import repeated
 from .memory import refuse
 from .model import Model, batch_of
 from .spatial import Vec3
-from .spread import lowered_share, means, over_cores, over_devices
+from .spread import any_traced, lowered_share, means, over_cores, over_devices
 from .state import State, World, Wrench
 from .step import (
     advance,
@@ -40,6 +42,7 @@ from .step import (
     with_memory,
 )
 from .tiles import tiled
+from .xla import on_cpu
 
 
 def step(model: Model, state: State, control=None) -> State:
@@ -94,8 +97,9 @@ def rollout(
         what happened since the last cut before it.
       donate: let the result take the memory of ``state``, which must not be used again.
 
-    A call that is made rather than traced, of many worlds and without a control function, is spread over all local
-    devices of JAX, or over the cores of its only CPU (:func:`rbd_jax.use_cores`); it then waits for the result. What
+    A call that is made rather than traced, without a control function, runs on a CPU a program that serves every
+    number of steps between two samples and of substeps. Such a call of many worlds is spread over all local devices of
+    JAX, or over the cores of its only CPU (:func:`rbd_jax.use_cores`); it then waits for the result. What
     becomes of a world does not depend on that, nor on how many others there are if there are 32 or more.
 
     Returns:
@@ -124,15 +128,16 @@ def rollout(
         return _rollout_with(model, state, int(steps), int(every), control, blocks, truncate)
     _check_wrench(model, state, control)
     steps, every = int(steps), int(every)
-    core = _forward(steps, every)
-    use = means(core, (model, state, control), batch, steps)
+    core, args = _forward(model, state, control, steps, every)
+    use = means(core, args, batch, steps)
     refuse(state, math.prod(batch), steps // every + 1, 1 + (use.cores > 1), use.devices)
     if use.devices:
-        return over_devices(core, use.devices, model, state, control, batch, donate)
+        return over_devices(core, use.devices, *args, batch, donate)
     if use.cores > 1:
-        return over_cores(core, use.cores, model, state, control, batch)
-    call = _rollout_donated if donate else _rollout
-    return call(model, state, control, steps, every, blocks, truncate)
+        return over_cores(core, use.cores, *args, batch)
+    if not any_traced(args):
+        return (_here_donated if donate else _here)(core, *args)
+    return _rollout(model, state, control, steps, every, blocks, truncate)
 
 
 # --- checks, before anything is traced ---
@@ -240,12 +245,29 @@ def _sample(model: Model, p, world: World) -> State:
     return leave(model, p, world, None, memory=False)
 
 
+class Length(typing.NamedTuple):
+    """How long a rollout is: ``samples`` times ``every`` steps, and ``rest``.
+
+    ``every``, ``rest`` and ``substeps`` may be traced, of what is not differentiated. rest None: none; substeps None:
+    those of the method.
+    """
+
+    samples: int
+    every: int | jax.Array
+    rest: int | jax.Array | None = None
+    substeps: jax.Array | None = None
+
+    @classmethod
+    def of(cls, steps: int, every: int) -> Length:
+        samples = steps // every
+        return cls(samples, every if samples else 1, steps % every or None)
+
+
 def _rollout_batch(
     model: Model,
     state: State,
     wrench,
-    steps: int,
-    every: int,
+    length: Length,
     ask=None,
     blocks: tuple[int, ...] = (),
     truncate: int | None = None,
@@ -262,12 +284,13 @@ def _rollout_batch(
         of each sample.
     """
     batch = batch_of(model, state.batch_shape)
-    run = lambda model, state: _loop(model, state, batch, wrench, steps, every, ask, blocks, truncate, nudge)
+    run = lambda model, state: _loop(model, state, batch, wrench, length, ask, blocks, truncate, nudge)
     return _from_start(run, model, state, batch, safe)
 
 
-def _loop(model, state, batch, wrench, steps, every, ask, blocks, truncate, nudge):
-    p, world = enter(model, state, batch)
+def _loop(model, state, batch, wrench, length, ask, blocks, truncate, nudge):
+    samples, every, rest, parts = length
+    p, world = enter(model, state, batch, parts)
     dtype = state.x.x.dtype
     hot = None if ask is not None else _hot_wrench(wrench, batch, dtype)
 
@@ -314,9 +337,9 @@ def _loop(model, state, batch, wrench, steps, every, ask, blocks, truncate, nudg
             return jax.lax.scan(lambda world, x: interval(world, x, blocks), world, xs, length=count)
         return _in_blocks(sampled, world, xs, count, blocks[0] // every, blocks[1:])
 
-    samples, rest = steps // every, steps % every
-    cuts = None if truncate is None or truncate >= steps else np.arange(steps) % truncate == 0
-    if cuts is not None:
+    cuts = None
+    if truncate is not None and truncate < samples * every + (rest or 0):
+        cuts = np.arange(samples * every + (rest or 0)) % truncate == 0
         cuts[0] = False
     changes = None
     if nudge is not None:
@@ -327,7 +350,7 @@ def _loop(model, state, batch, wrench, steps, every, ask, blocks, truncate, nudg
     if samples:
         inside = None if cuts is None else cuts[: samples * every].reshape(samples, every)
         world, later = sampled(world, (inside, changes), samples, blocks)
-    if rest:
+    if rest is not None:
         world = run(world, None if cuts is None else cuts[samples * every :], rest, blocks)[0]
 
     def joined(a, b):
@@ -462,40 +485,67 @@ def _grow_model(model: Model, batched: Model, size: int) -> Model:
 
 def _in_tiles(core):
     """``core(model, state, wrench)``, a batch of worlds cut into tiles."""
-    return lambda model, state, wrench: tiled(core, model, state, wrench, batch_of(model, state.batch_shape))
+    return lambda model, state, wrench: tiled(core, model, state, wrench, {}, batch_of(model, state.batch_shape))
+
+
+def _forward(model: Model, state: State, wrench: Wrench | None, steps: int, every: int):
+    """``core`` and ``args``: ``core(*args)`` is the rollout, not to be differentiated.
+
+    Numbers of steps and substeps other than one are arguments where the call is made rather than traced, so that one
+    program serves all. Not on a GPU, which asks the host before each turn of a loop whose end it is not told before.
+    """
+    length, open_ = Length.of(steps, every), {}
+    if on_cpu() and not any_traced((model, state, wrench)):
+        if length.every > 1:
+            open_["every"] = length.every
+        if length.rest is not None:
+            open_["rest"] = length.rest
+        if model.method.substeps > 1:
+            open_["substeps"] = model.method.substeps
+            model = model._with(method=dataclasses.replace(model.method, substeps=None))
+    core = _core(length._replace(**dict.fromkeys(open_)))
+    return core, (model, state, wrench, {name: np.int32(count) for name, count in open_.items()})
 
 
 @functools.cache
-def _forward(steps: int, every: int):
-    """``core(model, state, wrench)`` of a rollout; one object for every pair of numbers."""
+def _core(length: Length):
+    """``core(model, state, wrench, counts)`` of a rollout, counts: numbers in the place of those of ``length``."""
 
-    def core(model, state, wrench):
-        return _rollout_batch(model, with_memory(model, state), wrench, steps, every)
+    def core(model, state, wrench, counts):
+        return _rollout_batch(model, with_memory(model, state), wrench, length._replace(**counts))
 
     return core
 
 
 @jax.jit
 def _step(model, state, wrench):
-    call = _batched_call(_in_tiles(_step_batch), functools.partial(_step_batch, safe=True))
+    one = lambda model, state, wrench, _: _step_batch(model, state, wrench)
+    call = _batched_call(_in_tiles(one), functools.partial(_step_batch, safe=True))
     return call(model, with_memory(model, state), wrench)
 
 
 def _rolled(model, state, wrench, steps, every, blocks, truncate):
-    core = _in_tiles(_forward(steps, every))
-    derived = functools.partial(_rollout_batch, steps=steps, every=every, blocks=blocks, truncate=truncate, safe=True)
-    return _batched_call(core, derived)(model, with_memory(model, state), wrench)
+    length = Length.of(steps, every)
+    derived = functools.partial(_rollout_batch, length=length, blocks=blocks, truncate=truncate, safe=True)
+    return _batched_call(_in_tiles(_core(length)), derived)(model, with_memory(model, state), wrench)
 
 
 _rollout = jax.jit(_rolled, static_argnums=(3, 4, 5, 6))
-_rollout_donated = jax.jit(_rolled, static_argnums=(3, 4, 5, 6), donate_argnums=(1,))
+
+
+def _of_here(core, model, state, wrench, counts):
+    return tiled(core, model, state, wrench, counts, batch_of(model, state.batch_shape))
+
+
+_here = jax.jit(_of_here, static_argnums=0)
+_here_donated = jax.jit(_of_here, static_argnums=0, donate_argnums=2)
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3, 4, 5, 6))
 def _rollout_with(model, state, steps, every, control, blocks, truncate):
     state = with_memory(model, state)
     ask, closed = asked(model, state, control)
-    core = functools.partial(_rollout_batch, steps=steps, every=every, ask=ask)
+    core = functools.partial(_rollout_batch, length=Length.of(steps, every), ask=ask)
     return _derived(core, functools.partial(core, blocks=blocks, truncate=truncate, safe=True))(model, state, closed)
 
 
@@ -505,9 +555,8 @@ def program(model: Model, state: State, steps: int, every: int):
     model, state: arrays or their shapes.
     """
     batch = state.batch_shape
-    core = _forward(steps, every)
-    parts = means(core, (model, state, None), batch, steps).cores
-    out = jax.eval_shape(core, model, state, None)
-    if parts > 1:
-        return lowered_share(core, model, state, batch, parts).compile(), parts, out
-    return _rollout.lower(model, state, None, steps, every, (), None).compile(), 1, out
+    core, args = _forward(model, state, None, steps, every)
+    parts = means(core, args, batch, steps).cores
+    out = jax.eval_shape(core, *args)
+    lowered = lowered_share(core, *args, batch, parts) if parts > 1 else _here.lower(core, *args)
+    return lowered.compile(), parts, out

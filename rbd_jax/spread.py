@@ -87,14 +87,18 @@ def _waits(core, args, batch, use: Means) -> bool:
     return _waiting[key]
 
 
+def any_traced(args) -> bool:
+    """Whether a call with these arguments is traced rather than made."""
+    return any(isinstance(c, jax.core.Tracer) for c in jax.tree.leaves(args))
+
+
 def _allowed(args, worlds: int, steps: int) -> Means:
     few, least = (1, LEAST_ALONE) if alone(args[0]) else (LANES, LEAST)
     if worlds <= few or worlds * steps < least or jax.config.jax_disable_jit:
         return Means()
-    leaves = jax.tree.leaves(args)
-    if any(isinstance(c, jax.core.Tracer) for c in leaves):
+    if any_traced(args):
         return Means()
-    arrays = [c for c in leaves if isinstance(c, jax.Array)]
+    arrays = [c for c in jax.tree.leaves(args) if isinstance(c, jax.Array)]
     where = {c.sharding for c in arrays if c.committed}
     devices = jax.local_devices()
     if len(devices) > 1 and jax.process_count() == 1 and all(len(s.device_set) == len(devices) for s in where):
@@ -112,9 +116,9 @@ def _pool(count: int) -> concurrent.futures.ThreadPoolExecutor:
     return concurrent.futures.ThreadPoolExecutor(count, thread_name_prefix="rbd_jax")
 
 
-@functools.partial(jax.jit, static_argnums=(0, 5, 6))
-def _share(core, model, state, wrench, first, batch, parts):
-    return tiled(core, model, state, wrench, batch, first, parts)
+@functools.partial(jax.jit, static_argnums=(0, 6, 7))
+def _share(core, model, state, wrench, counts, first, batch, parts):
+    return tiled(core, model, state, wrench, counts, batch, first, parts)
 
 
 @functools.partial(jax.jit, static_argnums=(1,))
@@ -123,27 +127,27 @@ def _joined(parts, batch):
     return jax.tree.map(lambda *c: jnp.concatenate(c)[:size].reshape(*batch, *c[0].shape[1:]), *parts)
 
 
-def lowered_share(core, model, state, batch, parts: int):
+def lowered_share(core, model, state, wrench, counts, batch, parts: int):
     """The program of one of ``parts`` shares, lowered; model and state may be shapes."""
-    return _share.lower(core, model, state, None, np.int32(0), batch, parts)
+    return _share.lower(core, model, state, wrench, counts, np.int32(0), batch, parts)
 
 
 _compiled: set = set()
 
 
-def over_cores(core, count: int, model: Model, state: State, wrench: Wrench | None, batch: tuple[int, ...]):
-    """``core(model, state, wrench)`` with a share of the batch on each of ``count`` threads; waits for the result."""
+def over_cores(core, count: int, model: Model, state: State, wrench: Wrench | None, counts, batch: tuple[int, ...]):
+    """``core(model, state, wrench, counts)`` with a share of the batch on each of ``count`` threads; waits for it."""
     wide, device = jax.config.jax_enable_x64, jax.config.jax_default_device
 
     def part(first):
-        run = lambda: jax.block_until_ready(_share(core, model, state, wrench, first, batch, count))
+        run = lambda: jax.block_until_ready(_share(core, model, state, wrench, counts, first, batch, count))
         if (wide, device) == (jax.config.jax_enable_x64, jax.config.jax_default_device):
             return run()
         with jax.enable_x64(wide), jax.default_device(device):  # settings of a context belong to its thread
             return run()
 
     numbers = [np.int32(k) for k in range(count)]
-    key = (_key(core, (model, state, wrench)), batch, count, wide)
+    key = (_key(core, (model, state, wrench, counts)), batch, count, wide)
     out = []
     if key not in _compiled:  # else every thread would compile the same program
         out.append(part(numbers.pop(0)))
@@ -155,27 +159,27 @@ def over_cores(core, count: int, model: Model, state: State, wrench: Wrench | No
 # --- devices ---
 
 
-def _shard(core, model, state, wrench, mesh, batch):
+def _shard(core, model, state, wrench, counts, mesh, batch):
     size = math.prod(batch)
     args = flattened(model, state, wrench, batch)
     varies = per_world(*args)
     whole = padded(size, mesh.size)
     args = jax.tree.map(lambda c, own: filled(c, whole) if own else c, args, varies)
     split, same = jax.sharding.PartitionSpec(AXIS), jax.sharding.PartitionSpec()
-    specs = jax.tree.map(lambda own: split if own else same, varies)
+    specs = *jax.tree.map(lambda own: split if own else same, varies), same
     run = lambda *args: tiled(core, *args, (whole // mesh.size,))
-    out = jax.shard_map(run, mesh=mesh, in_specs=specs, out_specs=split, check_vma=False)(*args)
+    out = jax.shard_map(run, mesh=mesh, in_specs=specs, out_specs=split, check_vma=False)(*args, counts)
     return jax.tree.map(lambda c: c[:size].reshape(*batch, *c.shape[1:]), out)
 
 
-_sharded = jax.jit(_shard, static_argnums=(0, 4, 5))
-_sharded_donated = jax.jit(_shard, static_argnums=(0, 4, 5), donate_argnums=(2,))
+_sharded = jax.jit(_shard, static_argnums=(0, 5, 6))
+_sharded_donated = jax.jit(_shard, static_argnums=(0, 5, 6), donate_argnums=(2,))
 
 
-def over_devices(core, devices, model: Model, state: State, wrench: Wrench | None, batch, donate: bool):
-    """``core(model, state, wrench)`` with the batch sharded over ``devices``."""
+def over_devices(core, devices, model: Model, state: State, wrench: Wrench | None, counts, batch, donate: bool):
+    """``core(model, state, wrench, counts)`` with the batch sharded over ``devices``."""
     call = _sharded_donated if donate else _sharded
-    return call(core, model, state, wrench, _mesh(devices), tuple(batch))
+    return call(core, model, state, wrench, counts, _mesh(devices), tuple(batch))
 
 
 def _mesh(devices):

@@ -19,6 +19,7 @@ from jax.custom_derivatives import SymbolicZero
 from .bodies import Bodies
 from .detect import chosen, detect, everything, of_places, put_back
 from .events import advance_to_impacts, carried
+from .loops import repeat
 from .model import Model, Params, params
 from .solvers.base import Problem, Solution
 from .solvers.restitution import normal_velocity, targets
@@ -177,12 +178,17 @@ def restored(state: State, given: State, lost: jax.Array) -> State:
     return state._with(**{k: jax.tree.map(back, getattr(state, k), getattr(given, k)) for k in names})
 
 
-def enter(model: Model, state: State, batch: tuple[int, ...]) -> tuple[Params, World]:
-    """Hot numbers and hot world of a public state whose leaves have batch axes ``batch``."""
+def enter(
+    model: Model, state: State, batch: tuple[int, ...], substeps: jax.Array | None = None
+) -> tuple[Params, World]:
+    """Hot numbers and hot world of a public state whose leaves have batch axes ``batch``.
+
+    substeps: see ``params``.
+    """
     s = model.structure
     state = grown(state, batch)
     one = opaque_one(model.dt)
-    p = params(model, batch, one)
+    p = params(model, batch, one, substeps)
     hot = to_hot(state, batch)
     memory = hot.memory
     if s.attitude:
@@ -213,7 +219,8 @@ def leave(model: Model, p: Params, world: World, batch: tuple[int, ...] | None, 
     else:
         quat = bodies.q if p.principal is None else bodies.q @ p.principal.conj()
         spin = piece(_angular_velocity)(p, bodies)
-    dt = jnp.broadcast_to(p.h * model.method.substeps, world.step.shape)
+    parts = model.method.substeps if p.substeps is None else p.substeps.astype(p.h.dtype)
+    dt = jnp.broadcast_to(p.h * parts, world.step.shape)
     L = None if model.structure.isotropic else bodies.L
     kept = Memory(L, bodies.R, world.contacts, world.feature, world.pairs) if memory else None
     hot = State(bodies.x, bodies.v, quat, spin, world.step, world.status, dt, world.kinematic, kept)
@@ -288,6 +295,8 @@ def watched(model: Model, p: Params, world: World, wrench: Wrench | None, watch)
 def substeps(model: Model, p: Params, world: World, wrench: Wrench | None, watch=None):
     """The world after all parts of a step, whatever has become of it, and what ``watch`` says of each."""
     part = lambda world, _: _substep(model, p, world, wrench, watch)
+    if p.substeps is not None:
+        return repeat(0, p.substeps, lambda _, world: part(world, None)[0], world), None
     count = model.method.substeps
     if count > 1:
         return jax.lax.scan(part, world, None, length=count)

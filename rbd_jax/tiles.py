@@ -89,19 +89,22 @@ def flattened(model: Model, state: State, wrench: Wrench | None, batch: tuple[in
     return model, state, jax.tree.map(lambda c: flat(c, 2), wrench)
 
 
-def tiled(core, model: Model, state: State, wrench: Wrench | None, batch: tuple[int, ...], first=0, parts: int = 1):
-    """``core(model, state, wrench)``, a tree of arrays with the batch in front, tile by tile.
+def tiled(
+    core, model: Model, state: State, wrench: Wrench | None, counts, batch: tuple[int, ...], first=0, parts: int = 1
+):
+    """``core(model, state, wrench, counts)``, a tree of arrays with the batch in front, tile by tile.
 
+    counts: numbers that all worlds share.
     first, parts: of ``parts`` equal shares that with number ``first`` (may be traced); its results have one batch
     axis and include the worlds that fill up the last tile.
     """
     worlds = math.prod(batch)
     if not on_cpu():
         with forward():
-            return core(model, state, wrench)
+            return core(model, state, wrench, counts)
     tiles, width = width_of(worlds, parts, alone(model))
     if tiles * width == worlds and tiles == 1 and parts == 1:
-        return single(core, width)(model, state, wrench)
+        return single(core, width)(model, state, wrench, counts)
     args = flattened(model, state, wrench, batch)
     varies = per_world(*args)
     fold = lambda c, b: filled(c, tiles * width).reshape(tiles, width, *c.shape[1:]) if b else c
@@ -110,7 +113,7 @@ def tiled(core, model: Model, state: State, wrench: Wrench | None, batch: tuple[
 
     def tile(k):
         at = lambda c, b: jax.lax.dynamic_index_in_dim(c, k, keepdims=False) if b else c
-        return run(*jax.tree.map(at, args, varies))
+        return run(*jax.tree.map(at, args, varies), counts)
 
     if share == 1:
         out = tile(first)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import rbd_jax as rbd
-from rbd_jax.rollout import _rollout_batch
+from rbd_jax.rollout import Length, _rollout_batch
 from rbd_jax.step import with_memory
 
 
@@ -35,7 +35,7 @@ def step_operations(scene, method="fast", batch=4):
     """Operations of one step of the hot loop."""
     model, state = rbd.build(scene, method=method)
     state = with_memory(model, rbd.batch(state, batch))
-    jaxpr = jax.make_jaxpr(lambda m, s: _rollout_batch(m, s, None, 4, 2))(model, state)
+    jaxpr = jax.make_jaxpr(lambda m, s: _rollout_batch(m, s, None, Length.of(4, 2)))(model, state)
     loops = []
 
     def find(jaxpr):

@@ -45,8 +45,8 @@ def forward():
         _forward.reset(token)
 
 
-def repeated(run, world, *given, worlds: int, count: int):
-    """``world = run(world, *given)``, ``count`` times (fixed), of as many worlds.
+def repeated(run, world, *given, worlds: int, count: int | jax.Array):
+    """``world = run(world, *given)``, ``count`` times, of as many worlds; a traced count is not to be differentiated.
 
     All leaves of ``world`` have an axis of worlds at the end, those of ``given`` too or one element there (or no axis)
     for what the worlds share. What becomes of a world must not depend on the others: where that can be, each is a
@@ -58,6 +58,8 @@ def repeated(run, world, *given, worlds: int, count: int):
             return launched(_many(run), worlds, jnp.full((1,), count, jnp.int32), world, *given)
         except (Unsupported, CompileError) as reason:
             warnings.warn(f"these steps are not one kernel of the GPU, and slower: {reason}", stacklevel=2)
+    if not isinstance(count, int):
+        return repeat(0, count, lambda _, world: run(world, *given), world)
     if count == 1:
         return run(world, *given)
     return jax.lax.scan(lambda world, _: (run(world, *given), None), world, None, length=count)[0]

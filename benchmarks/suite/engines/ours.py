@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
-import math
 import time
 
 import jax
@@ -23,12 +23,6 @@ PRESETS = {
 }
 #: Impacts at their own instant, in any preset.
 EVENTS = 4
-#: A call shorter than this [s] is made longer, so that the cost of calling (about 0.1 ms) is not what is measured.
-SHORT = 2e-3
-#: A program that compiles in less [s] is made for every number of steps that is asked for.
-QUICK = 2.0
-#: A call of an error run has so many steps or more, where it can: a call of fewer costs more than they do.
-CALLED = 8
 
 
 def _method(variant: str, case: Case) -> rbd.Method:
@@ -84,23 +78,21 @@ class Ours(Engine):
         return _Simulation(case, _method(variant, case), dt, dtype)
 
 
-@functools.cache
-def _cost(key) -> list:
-    """[seconds a step, seconds to compile] of a program and number of worlds, found by the first timing of a sweep."""
-    return []
+#: Programs that have been timed: (case, method, dtype, worlds), the method without its substeps.
+_seen: set = set()
 
 
 class _Simulation(Simulation):
     def __init__(self, case, method, dt, dtype):
         self.wide = dtype == "float64"
-        self.key = (case.name, method, dtype)
         self.compile_s = {}
-        self.counts, self.samples = [case.steps_a_sample(dt) for dt in case.steps], case.samples
         with self._width():
             try:
                 self.model, self.one = rbd.build(case.scene(), dt=dt, method=method)
             except ValueError as error:
                 raise Refused(str(error).split("\n")[0]) from error
+        method = self.model.method  # one program serves all numbers of steps, and of substeps but one
+        self.key = (case.name, dataclasses.replace(method, substeps=min(method.substeps, 2)), dtype)
 
     def _width(self):
         return jax.enable_x64(True) if self.wide else contextlib.nullcontext()
@@ -113,14 +105,8 @@ class _Simulation(Simulation):
         with self._width():
             state = self._state(start)
             seen = [state]
-            chunk = math.gcd(steps_a_sample, *self.counts)  # one program for all steps of the sweep, or two
-            if chunk < CALLED and steps_a_sample % (10 * chunk) == 0:
-                chunk *= 10
-            if not self.model.structure.groups:
-                chunk = steps_a_sample  # quick to compile
             for _ in range(samples):
-                for _ in range(steps_a_sample // chunk):
-                    state = rbd.rollout(self.model, state, chunk, every=chunk)[0]
+                state = self._after(state, steps_a_sample)
                 seen.append(state)
             columns = [np.stack([np.asarray(getattr(s, k), np.float64) for s in seen])
                        for k in ("pos", "quat", "vel", "omega")]  # fmt: skip
@@ -131,32 +117,19 @@ class _Simulation(Simulation):
         with self._width():
             first = self._state(start)
         worlds = first.pos.shape[0]
-        sample = min(self.counts)  # steps between two samples at the coarsest step, which divide all others
-        lengths = [sample * self.samples, 10 * sample * self.samples]  # a program a step would take hours to compile
-        if worlds > 1:
-            lengths.insert(0, sample)
-        cost = _cost((*self.key, worlds))
-        if not cost:
+        if (*self.key, worlds) not in _seen:
+            _seen.add((*self.key, worlds))
             begin = time.perf_counter()
-            self._run(first, lengths[0], lengths[0])
+            self._run(first, steps)
             self.compile_s[worlds] = time.perf_counter() - begin
-            begin = time.perf_counter()
-            self._run(first, lengths[0], lengths[0])
-            cost += (time.perf_counter() - begin) / lengths[0], self.compile_s[worlds]
-        chunk = lengths[0]
-        for longer in lengths[1:]:
-            if steps % longer == 0 and chunk * cost[0] < SHORT:
-                chunk = longer
-        if chunk * cost[0] < SHORT and cost[1] < QUICK:
-            chunk = steps
-        count = max(steps // chunk, 1) * chunk
-        return functools.partial(self._run, first, count, chunk), worlds, count
+        return functools.partial(self._run, first, steps), worlds, steps
 
-    def _run(self, state, steps, chunk):
+    def _after(self, state, steps):
+        return rbd.rollout(self.model, state, steps, every=steps)[0]
+
+    def _run(self, state, steps):
         with self._width():
-            for _ in range(steps // chunk):
-                state = rbd.rollout(self.model, state, chunk, every=chunk)[0]
-            jax.block_until_ready(state)
+            jax.block_until_ready(self._after(state, steps))
 
 
 ENGINE = Ours()
