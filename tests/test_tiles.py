@@ -93,6 +93,29 @@ def test_bits_do_not_depend_on_threads(worlds, monkeypatch):
         assert same(run(model, state), alone), f"{name}: {count} threads"
 
 
+def test_one_program_serves_every_number_of_steps():
+    from rbd_jax.rollout import _here
+
+    scene = SCENES["three balls"]
+    before = _here._cache_size()
+    for dt, steps, every in ((0.012, 8, 4), (0.012, 6, 3), (0.02, 14, 7)):  # three and five substeps
+        model, one = rbd.build(scene, dt=dt, method="fast")
+        assert model.method.substeps == (3 if dt == 0.012 else 5)
+        state = rbd.batch(one, 32)
+        final, traj = rbd.rollout(model, state, steps, every=every)
+        assert traj.pos.shape == (32, 3, 3, 3) and (np.asarray(final.step) == steps).all()
+        for _ in range(steps):
+            state = rbd.step(model, state)
+        np.testing.assert_allclose(final.pos, state.pos, atol=1e-6)
+        np.testing.assert_allclose(final.dt, dt, rtol=1e-6)
+    assert _here._cache_size() == before + 1
+    model, one = rbd.build(scene, dt=0.012, method="fast")
+    state = rbd.batch(one, 32)
+    rests = [rbd.rollout(model, state, steps, every=4)[0] for steps in (9, 11)]  # one, and three, after two samples
+    assert _here._cache_size() == before + 2
+    assert [int(r.step[0]) for r in rests] == [9, 11]
+
+
 def test_the_step_runs_as_one_function(worlds):
     _, model, state = worlds
     if jax.default_backend() == "cpu":  # before XLA, which puts the mark on tiny loops itself
