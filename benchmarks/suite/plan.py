@@ -41,7 +41,7 @@ class Job:
     both: tuple[str, ...] = ()
     batches: tuple[int, ...] = (1, 1024)
     error_s: float = 3.0
-    time_s: float = 0.1
+    time_s: float = 0.05
     limit_s: float = 120.0
 
 
