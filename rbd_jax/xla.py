@@ -155,7 +155,8 @@ def one_function(run, longest: int | None = None, longest_part: int = 0):
             inner.__name__ = getattr(getattr(run, "func", run), "__name__", "run")  # its name in profiles
             # XLA's own mark of a call that its CPU backend emits as one function; it sets it on tiny loops itself.
             marked = set_xla_metadata(jax.jit(inner)(*leaves), xla_cpu_small_call="true", inlineable="false")
-            return jax.tree.structure(shape).unflatten(marked[0])
+            # JAX does not look through a barrier for what is not used behind it, and XLA takes it away at last
+            return jax.tree.structure(shape).unflatten(jax.lax.optimization_barrier(marked)[0])
         if longest is None:
             return run(*args)
         with _traced_as("pieces", longest_part):

@@ -166,6 +166,9 @@ def test_a_long_program_is_cut_into_pieces():
 def test_an_argument_that_nothing_uses_is_no_trouble():
     call = jax.jit(one_function(lambda x, y: x * 2), keep_unused=True)
     assert float(call(jnp.float32(3), jnp.arange(5.0))) == 6
+    # of no use to XLA, which aborts, though JAX does not know
+    folded = jax.jit(one_function(lambda x, y: (x + y * 0, x * 2)))
+    np.testing.assert_array_equal(folded(jnp.arange(3), jnp.arange(3)), [[0, 1, 2], [0, 2, 4]])
 
 
 def test_loops_take_in_and_carry_what_their_results_depend_on():
