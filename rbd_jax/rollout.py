@@ -483,9 +483,9 @@ def _grow_model(model: Model, batched: Model, size: int) -> Model:
     return model._with(**changes) if changes else model
 
 
-def _in_tiles(core):
-    """``core(model, state, wrench)``, a batch of worlds cut into tiles."""
-    return lambda model, state, wrench: tiled(core, model, state, wrench, {}, batch_of(model, state.batch_shape))
+def _in_tiles(core, model, state, wrench, counts):
+    """``core(model, state, wrench, counts)``, a batch of worlds cut into tiles."""
+    return tiled(core, model, state, wrench, counts, batch_of(model, state.batch_shape))
 
 
 def _forward(model: Model, state: State, wrench: Wrench | None, steps: int, every: int):
@@ -520,25 +520,21 @@ def _core(length: Length):
 @jax.jit
 def _step(model, state, wrench):
     one = lambda model, state, wrench, _: _step_batch(model, state, wrench)
-    call = _batched_call(_in_tiles(one), functools.partial(_step_batch, safe=True))
+    call = _batched_call(functools.partial(_in_tiles, one, counts={}), functools.partial(_step_batch, safe=True))
     return call(model, with_memory(model, state), wrench)
 
 
 def _rolled(model, state, wrench, steps, every, blocks, truncate):
     length = Length.of(steps, every)
     derived = functools.partial(_rollout_batch, length=length, blocks=blocks, truncate=truncate, safe=True)
-    return _batched_call(_in_tiles(_core(length)), derived)(model, with_memory(model, state), wrench)
+    direct = functools.partial(_in_tiles, _core(length), counts={})
+    return _batched_call(direct, derived)(model, with_memory(model, state), wrench)
 
 
 _rollout = jax.jit(_rolled, static_argnums=(3, 4, 5, 6))
 
-
-def _of_here(core, model, state, wrench, counts):
-    return tiled(core, model, state, wrench, counts, batch_of(model, state.batch_shape))
-
-
-_here = jax.jit(_of_here, static_argnums=0)
-_here_donated = jax.jit(_of_here, static_argnums=0, donate_argnums=2)
+_here = jax.jit(_in_tiles, static_argnums=0)
+_here_donated = jax.jit(_in_tiles, static_argnums=0, donate_argnums=2)
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3, 4, 5, 6))
