@@ -24,7 +24,7 @@ from .kernel import repeated
 from .memory import refuse
 from .model import Model, batch_of
 from .spatial import Vec3
-from .spread import any_traced, lowered_share, means, over_cores, over_devices
+from .spread import any_traced, first_changing, lowered_share, means, over_cores, over_devices
 from .state import State, World, Wrench
 from .step import (
     advance,
@@ -42,7 +42,7 @@ from .step import (
     with_memory,
 )
 from .tiles import tiled
-from .xla import on_cpu
+from .xla import no_collections, on_cpu
 
 
 def step(model: Model, state: State, control=None) -> State:
@@ -64,7 +64,11 @@ def step(model: Model, state: State, control=None) -> State:
     if callable(control):
         control = control(model, state)
     _check_wrench(model, state, control)
-    return _step(model, state, control)
+    changing = first_changing((model, state, control))
+    if changing is None:
+        return _step(model, state, control)
+    with no_collections():
+        return _differentiated_step(model, state, control, changing)
 
 
 def rollout(
@@ -137,7 +141,11 @@ def rollout(
         return over_cores(core, use.cores, *args, batch)
     if not any_traced(args):
         return (_here_donated if donate else _here)(core, *args)
-    return _rollout(model, state, control, steps, every, blocks, truncate)
+    changing = first_changing((model, state, control))
+    if changing is None:
+        return _rollout(model, state, control, steps, every, blocks, truncate)
+    with no_collections():
+        return _differentiated(model, state, control, steps, every, blocks, truncate, changing)
 
 
 # --- checks, before anything is traced ---
@@ -524,14 +532,37 @@ def _step(model, state, wrench):
     return call(model, with_memory(model, state), wrench)
 
 
-def _rolled(model, state, wrench, steps, every, blocks, truncate):
+@functools.partial(jax.jit, static_argnums=3)
+def _differentiated_step(model, state, wrench, changing: int):
+    """``_step``, as ``_differentiated`` is a rollout."""
+    return _step_batch(model, _changing(model, state, wrench, changing), wrench, safe=True)
+
+
+@functools.partial(jax.jit, static_argnums=(3, 4, 5, 6))
+def _rollout(model, state, wrench, steps, every, blocks, truncate):
     length = Length.of(steps, every)
-    derived = functools.partial(_rollout_batch, length=length, blocks=blocks, truncate=truncate, safe=True)
     direct = functools.partial(_in_tiles, _core(length), counts={})
-    return _batched_call(direct, derived)(model, with_memory(model, state), wrench)
+    call = _batched_call(direct, functools.partial(_safe_rollout, length, blocks, truncate))
+    return call(model, with_memory(model, state), wrench)
 
 
-_rollout = jax.jit(_rolled, static_argnums=(3, 4, 5, 6))
+def _safe_rollout(length, blocks, truncate, model, state, wrench):
+    return _rollout_batch(model, state, wrench, length, blocks=blocks, truncate=truncate, safe=True)
+
+
+@functools.partial(jax.jit, static_argnums=(3, 4, 5, 6, 7))
+def _differentiated(model, state, wrench, steps, every, blocks, truncate, changing: int):
+    """``_rollout`` of which a derivative is being taken, with respect to leaf ``changing`` of (model, state, wrench)
+    and perhaps others; JAX would trace the program that is not differentiated as well, which takes as long.
+    """
+    state = _changing(model, state, wrench, changing)
+    return _safe_rollout(Length.of(steps, every), blocks, truncate, model, state, wrench)
+
+
+def _changing(model, state, wrench, number: int) -> State:
+    """``state`` with memory, as ``_touched`` by leaf ``number`` of (model, state, wrench)."""
+    return _touched(with_memory(model, state), model, jax.tree.leaves((model, state, wrench))[number : number + 1])
+
 
 _here = jax.jit(_in_tiles, static_argnums=0)
 _here_donated = jax.jit(_in_tiles, static_argnums=0, donate_argnums=2)

@@ -92,6 +92,15 @@ def any_traced(args) -> bool:
     return any(isinstance(c, jax.core.Tracer) for c in jax.tree.leaves(args))
 
 
+#: JAX's tracers of derivatives; it does not export all of them. An unknown one costs time to trace, no more.
+CHANGING = ("JVPTracer", "LinearizeTracer")
+
+
+def first_changing(args) -> int | None:
+    """Number of the first leaf of which a derivative is being taken by the innermost transformation; None: of none."""
+    return next((i for i, c in enumerate(jax.tree.leaves(args)) if type(c).__name__ in CHANGING and c.size), None)
+
+
 def _allowed(args, worlds: int, steps: int) -> Means:
     few, least = (1, LEAST_ALONE) if alone(args[0]) else (LANES, LEAST)
     if worlds <= few or worlds * steps < least or jax.config.jax_disable_jit:

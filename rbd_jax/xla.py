@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import contextvars
 import functools
+import gc
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +37,9 @@ def materialise(tree, one: jax.Array | float | None = 1.0):
     """
     if one is None or in_a_thread():
         return tree
-    return jax.tree.map(lambda x: x / jax.lax.stop_gradient(one + 0.0 * x), tree)
+    constant = jax.lax.stop_gradient  # of the factors, not of their product: its tangent would be traced for nothing
+    one = constant(one)
+    return jax.tree.map(lambda x: x / (one + 0.0 * constant(x)), tree)
 
 
 def materialise_linear(tree, like: jax.Array, one):
@@ -45,6 +48,20 @@ def materialise_linear(tree, like: jax.Array, one):
         return tree
     unit = jax.lax.stop_gradient(one + 0.0 * like)
     return jax.tree.map(lambda x: x / unit, tree)
+
+
+@contextlib.contextmanager
+def no_collections():
+    """A context in which Python does not look for cycles: JAX makes a million objects to trace a program, of which
+    few become garbage, and to go through them again and again takes a third of the time, of a derivative half of it.
+    """
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 # --- one function of the CPU ---
@@ -137,13 +154,14 @@ def one_function(run, longest: int | None = None, longest_part: int = 0):
     def call(*args):
         if not on_cpu():
             return run(*args)
-        with _traced_as("one"):
+        with no_collections(), _traced_as("one"):
             traced, shape = jax.make_jaxpr(run, return_shape=True)(*args)
         length = _length(traced.jaxpr)
         if length is not None and (longest is None or length <= longest):
             # XLA's emitter of such functions cannot pass an argument by that nothing in them uses: there are none but
             # those that are used, and as XLA may find more than JAX to be of no use, all are results too
-            short, used = lean(traced.jaxpr)
+            with no_collections():
+                short, used = lean(traced.jaxpr)
             leaves = [c for c, u in zip(jax.tree.leaves(args), used, strict=True) if u]
             if _would_be_divided(short):
                 name = getattr(run, "__name__", run)
@@ -159,7 +177,7 @@ def one_function(run, longest: int | None = None, longest_part: int = 0):
             return jax.tree.structure(shape).unflatten(jax.lax.optimization_barrier(marked)[0])
         if longest is None:
             return run(*args)
-        with _traced_as("pieces", longest_part):
+        with no_collections(), _traced_as("pieces", longest_part):
             return run(*args)
 
     return call
