@@ -1,5 +1,8 @@
 """Derivatives through rollouts: blocks, truncation, gradients by horizon, worlds that are lost on the way."""
 
+import gc
+import importlib
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -70,6 +73,29 @@ def test_blocks_and_cuts_leave_the_forward_program_as_it_is():
     blocked = rbd.rollout(model, state, STEPS, every=4, checkpoint=(10, 3), truncate=7)
     for a, b in zip(jax.tree.leaves(blocked), jax.tree.leaves(plain)):
         np.testing.assert_array_equal(a, b)
+
+
+def test_a_derivative_does_not_trace_the_program_that_has_none(monkeypatch):
+    """Which takes as long as what it needs; and the search for cycles, off meanwhile, is as it was before."""
+    model, state = rbd.build(falling(e=0.5), method="fast")
+
+    def refuse(*args, **counts):
+        raise AssertionError("the program that is not differentiated was traced")
+
+    monkeypatch.setattr(importlib.import_module("rbd_jax.rollout"), "_in_tiles", refuse)
+    height = lambda move: lambda vel: move(state.replace(vel=vel)).pos[0, 2]
+    moves = (lambda s: rbd.rollout(model, s, STEPS + 6)[0], lambda s: rbd.step(model, s))
+    for collects in (True, False):
+        (gc.enable if collects else gc.disable)()
+        try:
+            for move in moves:
+                slopes = [jax.make_jaxpr(d(height(move)))(state.vel) for d in (jax.grad, jax.jacfwd)]
+                assert all(slope.jaxpr.eqns for slope in slopes)
+            assert gc.isenabled() == collects
+        finally:
+            gc.enable()
+    with pytest.raises(AssertionError, match="was traced"):
+        jax.make_jaxpr(height(moves[0]))(state.vel)
 
 
 def test_memory_of_reverse_mode_hardly_grows_with_the_steps():

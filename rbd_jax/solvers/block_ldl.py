@@ -17,6 +17,7 @@ import numpy as np
 from ..loops import only_if, read, repeat, write
 from ..struct import struct
 from ..xla import materialise
+from .matrices import across
 
 
 @struct
@@ -66,11 +67,6 @@ def entry(c, r: int):
 
 def _column(block, j: int):
     return jax.lax.index_in_dim(block, j, 1, keepdims=False)
-
-
-def across(c):
-    """A column (1, m, B) as a row: one entry for every column of a block, (1, m, 1, B)."""
-    return c.reshape(1, c.shape[1], 1, c.shape[2])
 
 
 def _outer(left, d, right):

@@ -24,6 +24,7 @@ from ..spatial import Mat3, Vec3, components
 from ..struct import static, struct
 from ..xla import materialise, summed
 from .base import Problem
+from .matrices import frame, joined, rotated, transposed
 from .rows import Impulses, Index, Rows, add_rows, take, take_tree
 
 
@@ -299,7 +300,7 @@ def _uncoupled(cs, gs, rhs, problem: Problem):
     own = _own_block(problem, zero + 1.0 / problem.inv_mass, spin)
     h = [[None if x is None else zero + x for x in row] for row in own]
     for c, g in zip(cs, gs):
-        ((_, _, block), *_) = _pair_blocks(c, g, one, size)
+        block = _own_pair_block(c, g, one, size)
         for i in range(size):
             for j in range(size):
                 if block[i][j] is not None:
@@ -328,18 +329,18 @@ def _coupled(cs, gs, rhs, problem: Problem):
     batch_first = [c for c in cs if not isinstance(c.b, Index)]
     fixed = [(c, g) for c, g in zip(cs, gs) if isinstance(c.b, Index)]
     for c, g in fixed:
-        for p, q, blocks in _pair_blocks(c, g, one, size):
-            h = h.at[p.rows, q.rows].add(_stack(blocks, len(p), worlds, zero.dtype))
-    h = jnp.transpose(h, (4, 0, 1, 2, 3))  # (B, n, n, size, size)
+        for p, q, block in _pair_blocks(c, g, one, size):
+            h = h.at[p.rows, q.rows].add(jnp.broadcast_to(block, (len(p), size, size, worlds)))
+    h = jnp.transpose(h, (4, 0, 1, 2, 3))  # (B, n, n, size columns, size rows)
     if batch_first:
         world = jnp.arange(worlds)[None, :]
         for c, g in zip(cs, gs):
             if isinstance(c.b, Index):
                 continue
-            for p, q, blocks in _pair_blocks(c, g, one, size):
-                x = _stack(blocks, p.shape[0], worlds, zero.dtype)
+            for p, q, block in _pair_blocks(c, g, one, size):
+                x = jnp.broadcast_to(block, (p.shape[0], size, size, worlds))
                 h = h.at[world, p, q].add(jnp.transpose(x, (0, 3, 1, 2)))
-    h = jnp.transpose(h, (0, 1, 3, 2, 4)).reshape(worlds, n * size, n * size)
+    h = jnp.transpose(h, (0, 1, 4, 2, 3)).reshape(worlds, n * size, n * size)
     b = jnp.stack(components(rhs[0]) + (components(rhs[1]) if spin else ()), axis=1)  # (n, size, B)
     solve = _dense_general_solve if any(isinstance(g, Lagging) for g in gs) else _dense_solve
     x = solve(h, jnp.transpose(b, (2, 0, 1)).reshape(worlds, n * size))
@@ -363,90 +364,118 @@ def _own_block(problem: Problem, mass, spin: bool) -> list:
 
 
 def _pair_blocks(c: Contacts, g: Sym3 | Sym6 | Lagging, one, size: int):
-    """(body row, body column, size x size entries) of every block of J' G J of one group."""
+    """(body row, body column, block) of every block of J' G J of one group; blocks (P, size columns, size rows, B)."""
+    q = frame(c.t1, c.t2, c.n, one)
+    turn = lambda m: rotated(q, materialise(m, one), one)
+    symmetric = not isinstance(g, Lagging)
+    ends = [(c.b, c.rb)] if c.a is None else [(c.b, c.rb), (c.a, c.ra)]
+    force = turn(_force_velocity(g))
+    if c.rb is None:
+        fill = (0, size - 3)
+        force = jnp.pad(force, ((0, 0), fill, fill, (0, 0)))
+        for row, _ in ends:
+            for column, _ in ends:
+                yield row, column, force if row is column else -force
+        return
+    lower = [turn(_torque_velocity(g, r)) for _, r in ends]
+    upper = [transposed(m) for m in lower] if symmetric else [turn(_force_spin(g, r)) for _, r in ends]
+    spin = {}
+    for i, (row, left) in enumerate(ends):
+        for j, (column, right) in enumerate(ends):
+            known = symmetric and (j, i) in spin
+            spin[i, j] = transposed(spin[j, i]) if known else turn(_torque_spin(g, left, right))
+            block = joined(force, lower[i], upper[j], spin[i, j])
+            yield row, column, block if i == j else -block
+
+
+def _own_pair_block(c: Contacts, g: Sym3 | Sym6 | Lagging, one, size: int) -> list:
+    """The block of body B of every pair, rows of entries (P, B)."""
+    block = [[None] * size for _ in range(size)]
+
+    def put(row: int, column: int, m):
+        m = _rotate(c, materialise(m, one), one)
+        for i in range(3):
+            block[row + i][column : column + 3] = m[i]
+        return m
+
+    put(0, 0, _force_velocity(g))
+    if c.rb is None:
+        return block
+    lower = put(3, 0, _torque_velocity(g, c.rb))
+    put(3, 3, _torque_spin(g, c.rb, c.rb))
     if isinstance(g, Lagging):
-        blocks = zip(_pair_blocks(c, g.symmetric, one, size), _column_blocks(c, g.column, one, size))
-        for (i, j, block), more in blocks:
-            yield i, j, [[_add(x, y) for x, y in zip(*rows)] for rows in zip(block, more)]
-        return
-    k, cb, wb = _diagonal_blocks(c, g, c.rb, one)
-    yield c.b, c.b, _assemble(k, cb, wb, size)
-    if c.a is None:
-        return
-    _, ca, wa = _diagonal_blocks(c, g, c.ra, one)
-    yield c.a, c.a, _assemble(k, ca, wa, size)
-    # row a, column b: -[[K, Cb'], [Ca, Wab]]
-    wab = None if c.ra is None else _rotate(c, _torque_spin(c, g, c.ra, c.rb, one), one)
-    neg = lambda m: None if m is None else [[None if x is None else -x for x in row] for row in m]
-    ab = _assemble(neg(k), neg(ca), neg(wab), size, upper=neg(cb))
-    yield c.a, c.b, ab
-    yield c.b, c.a, [list(row) for row in zip(*ab)]
-
-
-def _column_blocks(c: Contacts, k: Impulses, one, size: int):
-    """The blocks of ``_pair_blocks``, in its order, of friction impulses k u_n."""
-    sides = [(c.rb, c.rb, 1.0)]
-    if c.a is not None:
-        sides += [(c.ra, c.ra, 1.0), (c.ra, c.rb, -1.0), (c.rb, c.ra, -1.0)]
-    x, y = k.t1, k.t2
-    for left, right, sign in sides:
-        force = [[None, None, (sign * x).sum(0)], [None, None, (sign * y).sum(0)], [None] * 3]
-        if left is None:
-            yield _assemble(_rotate(c, materialise(force, one), one), None, None, size)
-            continue
-        f = (sign * x, sign * y)
-        t = (-left.z * f[1], left.z * f[0], left.x * f[1] - left.y * f[0])
-        t = tuple(_add(a, None if b is None else sign * b) for a, b in zip(t, (k.r1, k.r2, k.s)))
-        arm = (right.y, -right.x)  # r x n
-        upper = [[*((v * a).sum(0) for a in arm), None] for v in f] + [[None] * 3]
-        lower = [[None, None, v.sum(0)] for v in t]
-        spin = [[*((v * a).sum(0) for a in arm), None] for v in t]
-        turned = [_rotate(c, materialise(m, one), one) for m in (force, lower, spin, upper)]
-        yield _assemble(*turned[:3], size, [list(r) for r in zip(*turned[3])])
-
-
-def _assemble(k, c, w, size: int, upper=None):
-    """[[K, U'], [C, W]] with U = C unless given."""
-    m = [[None] * size for _ in range(size)]
-    upper = c if upper is None else upper
+        put(0, 3, _force_spin(g, c.rb))
+        return block
     for i in range(3):
-        for j in range(3):
-            m[i][j] = k[i][j]
-            if c is not None:
-                m[3 + i][j] = c[i][j]
-                m[j][3 + i] = upper[i][j]
-                m[3 + i][3 + j] = w[i][j]
+        block[i][3:] = [lower[j][i] for j in range(3)]
+    return block
+
+
+# --- sums over the points of a pair in its contact frame: rows of entries (P, B), None = zero ---
+
+
+def _split(g: Sym3 | Sym6 | Lagging):
+    """F, X and T of the symmetric part as rows of entries, and what is added to the column of the normal velocity:
+    force (x, y) of the friction rows and their couples, None where there is none.
+    """
+    column = None
+    if isinstance(g, Lagging):
+        column, g = g.column, g.symmetric
+    if isinstance(g, Sym6):
+        return _full3(g.force), g.cross, _full3(g.torque), column
+    return _full3(g), UNCOUPLED, UNCOUPLED, column
+
+
+def _force_velocity(g):
+    """sum F"""
+    force, _, _, column = _split(g)
+    force = [[_slots(x) for x in row] for row in force]
+    if column is not None:
+        for row, x in zip(force, (column.t1, column.t2)):
+            row[2] = _add(row[2], _slots(x))
+    return force
+
+
+def _torque_velocity(g, r: Vec3):
+    """sum [r]x F + X'"""
+    force, cross, _, column = _split(g)
+    torque = [_cross(r, [force[i][j] for i in range(3)]) for j in range(3)]  # columns of [r]x F
+    m = [[_add(torque[j][i], cross[j][i]) for j in range(3)] for i in range(3)]
+    if column is not None:
+        for row, x in zip(m, _couple(column, r)):
+            row[2] = _add(row[2], x)
+    return [[_slots(x) for x in row] for row in m]
+
+
+def _force_spin(g: Lagging, r: Vec3):
+    """sum F [r]x' + X"""
+    back = _torque_velocity(g.symmetric, r)
+    m = [[back[j][i] for j in range(3)] for i in range(3)]
+    for row, x in zip(m, (g.column.t1, g.column.t2)):
+        for j, arm in enumerate((r.y, -r.x)):  # r x n
+            row[j] = _add(row[j], _slots(x * arm))
     return m
 
 
-def _diagonal_blocks(c: Contacts, g: Sym3 | Sym6, r: Vec3 | None, one):
-    """K, C, W of one body of every pair, world axes, entries (P, B)."""
-    if c.t1 is None:  # no tangents at all: K = G n n'
-        gn = materialise(summed(g.zz), one)
-        n = components(c.n)
-        return [[n[i] * n[j] * gn for j in range(3)] for i in range(3)], None, None
-    m = _full(g)
-    cross = g.cross if isinstance(g, Sym6) else UNCOUPLED
-    k = _rotate(c, materialise([[_slots(x) for x in row] for row in m], one), one)
-    if r is None:
-        return k, None, None
-    torque = [_cross(r, [m[i][j] for i in range(3)]) for j in range(3)]  # columns of [r]x F
-    cb = [[_slots(_add(torque[j][i], cross[j][i])) for j in range(3)] for i in range(3)]
-    return k, _rotate(c, materialise(cb, one), one), _rotate(c, _torque_spin(c, g, r, r, one), one)
+def _torque_spin(g, left: Vec3, right: Vec3):
+    """sum [left]x F [right]x' + [left]x X + X' [right]x' + T"""
+    force, x, t, column = _split(g)
+    torque = [_cross(left, [force[i][j] for i in range(3)]) for j in range(3)]
+    # ([left]x F + X') [right]x' , then [left]x X + T
+    w = [_cross(right, [_add(torque[j][i], x[j][i]) for j in range(3)]) for i in range(3)]
+    arm = [_cross(left, [x[i][j] for i in range(3)]) for j in range(3)]
+    m = [[_add(w[i][j], arm[j][i], t[i][j]) for j in range(3)] for i in range(3)]
+    if column is not None:
+        for row, c in zip(m, _couple(column, left)):
+            for j, arm in enumerate((right.y, -right.x)):
+                row[j] = _add(row[j], c * arm)
+    return [[_slots(x) for x in row] for row in m]
 
 
-def _torque_spin(c: Contacts, g: Sym3 | Sym6, ra: Vec3, rb: Vec3, one):
-    """Sum of [ra]x F [rb]x' + [ra]x X + X' [rb]x' + T in the contact frame."""
-    m = _full(g)
-    torque = [_cross(ra, [m[i][j] for i in range(3)]) for j in range(3)]
-    if not isinstance(g, Sym6):
-        w = [_cross(rb, [torque[j][i] for j in range(3)]) for i in range(3)]
-        return materialise([[_slots(x) for x in row] for row in w], one)
-    x, t = g.cross, _full3(g.torque)
-    # ([ra]x F + X') [rb]x' , then [ra]x X + T
-    w = [_cross(rb, [_add(torque[j][i], x[j][i]) for j in range(3)]) for i in range(3)]
-    arm = [_cross(ra, [x[i][j] for i in range(3)]) for j in range(3)]
-    return materialise([[_slots(_add(w[i][j], arm[j][i], t[i][j])) for j in range(3)] for i in range(3)], one)
+def _couple(column: Impulses, r: Vec3):
+    """Angular impulses (x, y, z) of friction impulses at r."""
+    x, y = column.t1, column.t2
+    return _add(-r.z * y, column.r1), _add(r.z * x, column.r2), _add(r.x * y - r.y * x, column.s)
 
 
 def _slots(x):
@@ -456,12 +485,13 @@ def _slots(x):
 UNCOUPLED = ((None,) * 3,) * 3
 
 
-def _full(g: Sym3 | Sym6):
+def full(g: Sym3 | Sym6):
     """The block F."""
     return _full3(g.force if isinstance(g, Sym6) else g)
 
 
 def _full3(g: Sym3):
+    """Rows of entries."""
     return [[g.xx, g.xy, g.xz], [g.xy, g.yy, g.yz], [g.xz, g.yz, g.zz]]
 
 
@@ -490,7 +520,10 @@ def _cross(r: Vec3, u):
 
 
 def _rotate(c: Contacts, m, one):
-    """Q m Q' with Q from the contact frame to world axes; entries (P, B)."""
+    """Q m Q' with Q from the contact frame to world axes; rows of entries (P, B)."""
+    if c.t1 is None:  # no tangents at all, and only m_zz
+        n = components(c.n)
+        return [[n[i] * n[j] * m[2][2] for j in range(3)] for i in range(3)]
     q = [components(row) for row in components_rows(c.basis)]
     half = [[_add(*(_mul(q[i][k], m[k][j]) for k in range(3))) for j in range(3)] for i in range(3)]
     half = materialise(half, one)

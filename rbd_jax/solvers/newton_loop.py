@@ -25,8 +25,9 @@ from ..struct import struct
 from ..xla import materialise, piece
 from . import block_ldl, dense
 from .base import Problem
-from .block_ldl import Blocks, across, entry
+from .block_ldl import Blocks, entry
 from .dense import Contacts
+from .matrices import across, combined, frame, rotated, transposed, vector
 from .rows import Impulses, Index, Rows
 
 #: What a row may lack [-], over the load and over the fastest relative velocity of its world (in float64 1e-3 of that).
@@ -232,31 +233,15 @@ def wrench(c: Contacts, p: Impulses, slot):
     return force, None if r is None else dense._cross(r, force)
 
 
-def frame(c: Contacts, one):
-    """t1, t2 and n as columns (1, 3, B); None where there are no tangents."""
-    column = lambda v: None if v is None else materialise(_column(components(v)), one)
-    return [column(c.t1), column(c.t2), column(c.n)]
-
-
-def _column(entries):
-    return jnp.concatenate([x.reshape(1, 1, x.shape[-1]) for x in entries], axis=1)
-
-
-def _combined(q, factors):
-    """sum of q_k f_k over the axes k that both have, (1, 3, B); f_k (1, B) or (1, 1, B)."""
-    scaled = [a * f.reshape(1, 1, f.shape[-1]) for a, f in zip(q, factors) if a is not None and f is not None]
-    return sum(scaled[1:], scaled[0])
-
-
 def on_bodies(x, q, force, torque, apart, bodies, one):
     """x (n, m, B) with a wrench about the centre of B added to B and taken from A; lists in the contact frame."""
-    force = materialise(_combined(q, force), one)
+    force = materialise(combined(q, force), one)
     x = add(x, (bodies[0], 0, 0), force)
     if len(bodies) > 1:
         x = add(x, (bodies[1], 0, 0), -force)
     if torque is None:
         return x
-    torque = materialise(_combined(q, torque), one)
+    torque = materialise(combined(q, torque), one)
     x = add(x, (bodies[0], 3, 0), torque)
     if len(bodies) > 1:
         x = add(x, (bodies[1], 3, 0), -torque - _crossed(apart, force))
@@ -274,7 +259,7 @@ def cross_columns(d: Vec3 | None, one):
         return None
     zero = 0.0 * d.x
     columns = ((zero, d.z, -d.y), (-d.z, zero, d.x), (d.y, -d.x, zero))
-    return [materialise(_column(c), one) for c in columns]
+    return [materialise(vector(c), one) for c in columns]
 
 
 # --- passes over the pairs ---
@@ -288,7 +273,7 @@ def totals(solver, g: Group, p: Impulses, total, one):
         plus = lambda slot, sums: jax.tree.map(jnp.add, sums, wrench(c, of_point(p, slot), slot))
         shape = jax.eval_shape(lambda: wrench(c, of_point(p, 0), 0))
         force, torque = over_points(g, pair, plus, jax.tree.map(lambda _: zero, shape))
-        return on_bodies(total, frame(c, one), force, torque, cross_columns(apart, one), bodies, one)
+        return on_bodies(total, frame(c.t1, c.t2, c.n, one), force, torque, cross_columns(apart, one), bodies, one)
 
     return over_pairs(g, add, total, g.c, p, g.apart)
 
@@ -358,7 +343,7 @@ def assembled(solver, g: Group, p: Impulses, bound, motion, h: Blocks, one) -> B
 
 def _sums(c: Contacts, hessian, residual: Impulses, slot):
     """What a point adds to the sums over a pair: wrench of its residual, lower triangles of K and Z, C between them."""
-    m = dense._full(hessian)
+    m = dense.full(hessian)
     lower = lambda m: [row[: i + 1] for i, row in enumerate(m)]
     r = of_point(c.rb, slot)
     if r is None:
@@ -380,9 +365,9 @@ def _add_pair(solver, g: Group, motion, one, pair, bodies, h: Blocks, c, law, fr
     plus = lambda slot, sums: jax.tree.map(jnp.add, sums, of(slot))
     (force, torque), k, cross, spin = over_points(g, pair, plus, start)
 
-    q = frame(c, one)
+    q = frame(c.t1, c.t2, c.n, one)
     full = lambda low: None if low is None else [[low[max(i, j)][min(i, j)] for j in range(3)] for i in range(3)]
-    k, cross, spin = (None if x is None else _rotated(q, x, one) for x in (full(k), cross, full(spin)))
+    k, cross, spin = (None if x is None else rotated(q, x, one) for x in (full(k), cross, full(spin)))
     apart = cross_columns(apart, one)
     h = h._with(b=on_bodies(h.b, q, force, torque, apart, bodies, one))
     h = h._with(diagonal=_added_block(h.diagonal, bodies[0], k, cross, spin))
@@ -394,14 +379,14 @@ def _add_pair(solver, g: Group, motion, one, pair, bodies, h: Blocks, c, law, fr
         back = lambda m: sum(m[:, i : i + 1] * across(apart[i]) for i in range(3))  # M [d]x'
         cross_a = materialise(cross + turn(k), one)  # [ra]x G
         spin_ba = materialise(spin + back(cross), one)  # [rb]x G [ra]x'
-        cross_ba = materialise(_transposed(cross_a), one)  # G [ra]x'
+        cross_ba = materialise(transposed(cross_a), one)  # G [ra]x'
         spin_a = spin_ba + turn(cross_ba)
     h = h._with(diagonal=_added_block(h.diagonal, bodies[1], k, cross_a, spin_a))
     row_b, row_a = bodies
     later = row_b > row_a  # the block below the diagonal is that of the later body's rows and the earlier one's columns
     at = block_ldl.place(jnp.maximum(row_b, row_a), jnp.minimum(row_b, row_a))
     minus = lambda x, y: None if x is None else jnp.where(later, -x, -y)
-    ab = (None, None, None) if spin is None else (cross_a, _transposed(cross), _transposed(spin_ba))
+    ab = (None, None, None) if spin is None else (cross_a, transposed(cross), transposed(spin_ba))
     block = -k, minus(cross, ab[0]), minus(spin_ba, ab[2]), minus(cross_ba, ab[1])
     for corner, part in zip(CORNERS, block if h.b.shape[1] == 6 else block[:1]):
         h = block_ldl.put(h, at, jnp.zeros_like(k) if part is None else part, *corner)  # what is there does not count
@@ -410,22 +395,6 @@ def _add_pair(solver, g: Group, motion, one, pair, bodies, h: Blocks, c, law, fr
 
 #: Column and row at which K, C, Z and U of a block [[K, U], [C, Z]] start.
 CORNERS = ((0, 0), (0, 3), (3, 3), (3, 0))
-
-
-def _transposed(m):
-    return jnp.swapaxes(m, 1, 2)
-
-
-def _rotated(q, m, one):
-    """Q M Q', (1, 3 columns, 3 rows, B), from the entries of M in the contact frame."""
-    total = None
-    for j in range(3):
-        if q[j] is None or all(m[i][j] is None for i in range(3)):
-            continue
-        half = materialise(_combined(q, [m[i][j] for i in range(3)]), one)
-        part = half[:, None] * across(q[j])
-        total = part if total is None else total + part
-    return materialise(total, one)
 
 
 def _added_block(blocks, row, *parts):
