@@ -37,9 +37,8 @@ def materialise(tree, one: jax.Array | float | None = 1.0):
     """
     if one is None or in_a_thread():
         return tree
-    constant = jax.lax.stop_gradient  # of the factors, not of their product: its tangent would be traced for nothing
-    one = constant(one)
-    return jax.tree.map(lambda x: x / (one + 0.0 * constant(x)), tree)
+    # ``one`` has no derivative; x loses it before the product, whose tangent would be traced for nothing
+    return jax.tree.map(lambda x: x / (one + 0.0 * jax.lax.stop_gradient(x)), tree)
 
 
 def materialise_linear(tree, like: jax.Array, one):
