@@ -150,17 +150,17 @@ def one_function(run, longest: int | None = None, longest_part: int = 0):
         among threads where it finds it worth while, and the emitter of one function then fails (invalid LLVM IR).
     """
 
+    @no_collections()
     def call(*args):
         if not on_cpu():
             return run(*args)
-        with no_collections(), _traced_as("one"):
+        with _traced_as("one"):
             traced, shape = jax.make_jaxpr(run, return_shape=True)(*args)
         length = _length(traced.jaxpr)
         if length is not None and (longest is None or length <= longest):
             # XLA's emitter of such functions cannot pass an argument by that nothing in them uses: there are none but
             # those that are used, and as XLA may find more than JAX to be of no use, all are results too
-            with no_collections():
-                short, used = lean(traced.jaxpr)
+            short, used = lean(traced.jaxpr)
             leaves = [c for c, u in zip(jax.tree.leaves(args), used, strict=True) if u]
             if _would_be_divided(short):
                 name = getattr(run, "__name__", run)
@@ -176,7 +176,7 @@ def one_function(run, longest: int | None = None, longest_part: int = 0):
             return jax.tree.structure(shape).unflatten(jax.lax.optimization_barrier(marked)[0])
         if longest is None:
             return run(*args)
-        with no_collections(), _traced_as("pieces", longest_part):
+        with _traced_as("pieces", longest_part):
             return run(*args)
 
     return call
