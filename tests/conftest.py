@@ -2,26 +2,12 @@
 
 import json
 import os
-import shutil
-import tempfile
 
 import pytest
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # Compile time is the cost of this suite: LLVM at its lowest level halves it and changes rounding only.
 os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_backend_optimization_level=0"
-
-# Tests in other workers and processes of this run take what one has compiled (JAX's own environment variables).
-KEPT = None
-if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-    KEPT = os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="rbd_jax_programs_")
-    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.5"
-
-
-def pytest_unconfigure():
-    if KEPT is not None:
-        shutil.rmtree(KEPT, ignore_errors=True)
-
 
 # Each compiled program takes memory maps, and Linux ends a process that asks for more of them than
 # vm.max_map_count (65,530 unless set otherwise).  A worker of the whole suite comes that far.
