@@ -188,56 +188,63 @@ def lean(jaxpr):
     JAX's own elimination leaves ``while`` loops as they are, with all that their bodies close over and all that
     they carry.
     """
-    return _needed(jaxpr, [True] * len(jaxpr.outvars))
+    return _Lean()(jaxpr, [True] * len(jaxpr.outvars))
 
 
-def _needed(jaxpr, results: list[bool], instantiate: bool | list[bool] = False):
-    """``dce_jaxpr`` that goes into ``while`` loops."""
-    jaxpr = _lean_loops(dce_jaxpr(jaxpr, results, instantiate=True)[0])
-    return dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars), instantiate=instantiate)
+class _Lean:
+    """``dce_jaxpr`` that goes into ``while`` loops; each body once for what is needed of it, however deep it lies."""
 
+    def __init__(self):
+        self.known = {}
 
-def _lean_loops(jaxpr):
-    """``jaxpr`` whose ``while`` loops take in and carry what their results depend on, and no more."""
+    def __call__(self, jaxpr, results: list[bool], instantiate: bool | list[bool] = False):
+        key = id(jaxpr), *results, *np.ravel(instantiate)
+        if key not in self.known:
+            short = self.loops(dce_jaxpr(jaxpr, results, instantiate=True)[0])
+            found = dce_jaxpr(short, [True] * len(short.outvars), instantiate=instantiate)
+            self.known[key] = jaxpr, found  # kept, so that no other takes its id
+        return self.known[key][1]
 
-    def inside(value):
-        if _closed(value):
-            return value.replace(jaxpr=_lean_loops(value.jaxpr))
-        if hasattr(value, "eqns"):
-            return _lean_loops(value)
-        return tuple(map(inside, value)) if type(value) is tuple else value
+    def loops(self, jaxpr):
+        """``jaxpr`` whose ``while`` loops take in and carry what their results depend on, and no more."""
 
-    needed = {v for v in jaxpr.outvars if not hasattr(v, "val")}
-    eqns = []
-    for e in reversed(jaxpr.eqns):
-        if e.primitive.name == "while":
-            e = _lean_loop(e, [v in needed for v in e.outvars])
-        else:
-            e = e.replace(params={k: inside(v) for k, v in e.params.items()})
-        needed |= {v for v in e.invars if not hasattr(v, "val")}
-        eqns.append(e)
-    return jaxpr.replace(eqns=eqns[::-1])
+        def inside(value):
+            if _closed(value):
+                return value.replace(jaxpr=self.loops(value.jaxpr))
+            if hasattr(value, "eqns"):
+                return self.loops(value)
+            return tuple(map(inside, value)) if type(value) is tuple else value
 
+        needed = {v for v in jaxpr.outvars if not hasattr(v, "val")}
+        eqns = []
+        for e in reversed(jaxpr.eqns):
+            if e.primitive.name == "while":
+                e = self.loop(e, [v in needed for v in e.outvars])
+            elif any(True for _ in called(e.params)):
+                e = e.replace(params={k: inside(v) for k, v in e.params.items()})
+            needed |= {v for v in e.invars if not hasattr(v, "val")}
+            eqns.append(e)
+        return jaxpr.replace(eqns=eqns[::-1])
 
-def _lean_loop(e, needed: list[bool]):
-    """A ``while`` of whose results some are needed."""
-    cond, body = e.params["cond_jaxpr"], e.params["body_jaxpr"]
-    first, count = e.params["cond_nconsts"], e.params["body_nconsts"]
-    asked = dce_jaxpr(cond.jaxpr, [True])[1][first:]
-    before = None
-    while before != needed:
-        before = needed
-        taken = _needed(body.jaxpr, needed)[1]
-        needed = [n or a or t for n, a, t in zip(needed, asked, taken[count:], strict=True)]
-    short, taken = _needed(body.jaxpr, needed, [False] * count + needed)
-    test = dce_jaxpr(cond.jaxpr, [True], instantiate=[True] * first + needed)[0]
-    keep = [True] * first + taken[:count] + needed
-    params = e.params | {
-        "cond_jaxpr": cond.replace(jaxpr=test), "body_jaxpr": body.replace(jaxpr=short),
-        "body_nconsts": sum(taken[:count]),
-    }  # fmt: skip
-    pick = lambda items, which: [x for x, k in zip(items, which, strict=True) if k]
-    return e.replace(invars=pick(e.invars, keep), outvars=pick(e.outvars, needed), params=params)
+    def loop(self, e, needed: list[bool]):
+        """A ``while`` of whose results some are needed."""
+        cond, body = e.params["cond_jaxpr"], e.params["body_jaxpr"]
+        first, count = e.params["cond_nconsts"], e.params["body_nconsts"]
+        asked = dce_jaxpr(cond.jaxpr, [True])[1][first:]
+        before = None
+        while before != needed:
+            before = needed
+            taken = self(body.jaxpr, needed)[1]
+            needed = [n or a or t for n, a, t in zip(needed, asked, taken[count:], strict=True)]
+        short, taken = self(body.jaxpr, needed, [False] * count + needed)
+        test = dce_jaxpr(cond.jaxpr, [True], instantiate=[True] * first + needed)[0]
+        keep = [True] * first + taken[:count] + needed
+        params = e.params | {
+            "cond_jaxpr": cond.replace(jaxpr=test), "body_jaxpr": body.replace(jaxpr=short),
+            "body_nconsts": sum(taken[:count]),
+        }  # fmt: skip
+        pick = lambda items, which: [x for x, k in zip(items, which, strict=True) if k]
+        return e.replace(invars=pick(e.invars, keep), outvars=pick(e.outvars, needed), params=params)
 
 
 def _closed(value) -> bool:

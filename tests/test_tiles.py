@@ -93,6 +93,23 @@ def test_bits_do_not_depend_on_threads(worlds, monkeypatch):
         assert same(run(model, state), alone), f"{name}: {count} threads"
 
 
+def test_cores_are_used_where_the_work_is_worth_it(monkeypatch):
+    """By what a world goes through: steps, substeps, bodies and points of contact."""
+    from rbd_jax import spread
+
+    monkeypatch.setattr(spread, "cores", lambda: 2)
+    cores = {}
+    for name in ("ball", "three balls"):
+        args = rbd.build(SCENES[name], dt=0.012, method="fast")
+        least = -(-spread.LEAST // (1000 * spread.work(args, 1)))
+        cores[name] = [spread._allowed(args, 1000, steps).cores for steps in (least - 1, least)]
+        assert spread._allowed(args, 32, 10**6).cores == 1, "a tile is not cut"
+    assert cores == {"ball": [1, 2], "three balls": [1, 2]}
+    model, one = args
+    points = sum(g.slots * len(g.a) for g in model.structure.groups)
+    assert spread.work(args, 5) == 5 * 3 * (3 + points) > 0, "three substeps"
+
+
 def test_one_program_serves_every_number_of_steps():
     from rbd_jax.rollout import _here
 
@@ -109,10 +126,13 @@ def test_one_program_serves_every_number_of_steps():
         np.testing.assert_allclose(final.pos, state.pos, atol=1e-6)
         np.testing.assert_allclose(final.dt, dt, rtol=1e-6)
     assert _here._cache_size() == before + 1
+    finals = [rbd.rollout(model, rbd.batch(one, 32), steps, every=steps)[0] for steps in (1, 2)]
+    assert _here._cache_size() == before + 2
+    assert [int(f.step[0]) for f in finals] == [1, 2]
     model, one = rbd.build(scene, dt=0.012, method="fast")
     state = rbd.batch(one, 32)
     rests = [rbd.rollout(model, state, steps, every=4)[0] for steps in (9, 11)]  # one, and three, after two samples
-    assert _here._cache_size() == before + 2
+    assert _here._cache_size() == before + 3
     assert [int(r.step[0]) for r in rests] == [9, 11]
 
 
@@ -193,6 +213,27 @@ def test_loops_take_in_and_carry_what_their_results_depend_on():
     assert len(outer.outvars) == 3, "the steps, the result and what is added to it"
     got = jax.core.eval_jaxpr(short, whole.consts, args[0], args[3])[0]
     assert np.array_equal(got, run(*args)) and np.array_equal(one_function(run)(*args), got)
+
+
+def test_a_body_is_searched_once_however_deep_it_lies(monkeypatch):
+    """Each level of loops would otherwise double or treble the work of the one inside: five are seconds."""
+    from rbd_jax import xla
+
+    def nested(depth, x):
+        if not depth:
+            return jnp.sin(x)
+        step = lambda c: (c[0] + 1, nested(depth - 1, c[1]), c[2] * 2.0)
+        return jax.lax.while_loop(lambda c: c[0] < 2, step, (0, x, x))[1]
+
+    searched = []
+    monkeypatch.setattr(xla, "dce_jaxpr", lambda *a, _plain=xla.dce_jaxpr, **k: searched.append(1) or _plain(*a, **k))
+    count = []
+    for depth in (3, 6):
+        searched.clear()
+        short, _ = xla.lean(jax.make_jaxpr(lambda x, depth=depth: nested(depth, x))(1.0).jaxpr)
+        count.append(len(searched))
+        assert len(short.eqns[-1].outvars) == 2, "what nothing depends on is not carried"
+    assert count[1] < 3 * count[0]
 
 
 def test_a_large_single_result_is_refused():
