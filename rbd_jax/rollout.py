@@ -499,12 +499,13 @@ def _in_tiles(core, model, state, wrench, counts):
 def _forward(model: Model, state: State, wrench: Wrench | None, steps: int, every: int):
     """``core`` and ``args``: ``core(*args)`` is the rollout, not to be differentiated.
 
-    Numbers of steps and substeps other than one are arguments where the call is made rather than traced, so that one
-    program serves all. Not on a GPU, which asks the host before each turn of a loop whose end it is not told before.
+    Numbers of steps and of substeps are arguments where the call is made rather than traced, so that one program serves
+    all; not a single substep, nor single steps between several samples. Not on a GPU, which asks the host before each
+    turn of a loop whose end it is not told before.
     """
     length, open_ = Length.of(steps, every), {}
     if on_cpu() and not any_traced((model, state, wrench)):
-        if length.every > 1:
+        if length.every > 1 or length.samples == 1:
             open_["every"] = length.every
         if length.rest is not None:
             open_["rest"] = length.rest

@@ -21,10 +21,8 @@ from .state import State, Wrench
 from .tiles import LANES, alone, filled, flattened, padded, per_world, tiled
 from .xla import on_cpu, waits
 
-#: Steps of worlds of a call for which threads are worth their start (0.2 ms).
-LEAST = 20_000
-#: The same for worlds that are tiles of their own, which are larger.
-LEAST_ALONE = 200
+#: Work of a call for which threads are worth their start (0.6 ms), see ``work``.
+LEAST = 60_000
 
 AXIS = "worlds"
 
@@ -102,8 +100,8 @@ def first_changing(args) -> int | None:
 
 
 def _allowed(args, worlds: int, steps: int) -> Means:
-    few, least = (1, LEAST_ALONE) if alone(args[0]) else (LANES, LEAST)
-    if worlds <= few or worlds * steps < least or jax.config.jax_disable_jit:
+    few = 1 if alone(args[0]) else LANES
+    if worlds <= few or worlds * work(args, steps) < LEAST or jax.config.jax_disable_jit:
         return Means()
     if any_traced(args):
         return Means()
@@ -115,6 +113,14 @@ def _allowed(args, worlds: int, steps: int) -> Means:
     if on_cpu() and all(s.num_devices == 1 for s in where):
         return Means(cores=cores())
     return Means()
+
+
+def work(args, steps: int) -> int:
+    """Bodies and points of contact, touching or not, that a world goes through in so many steps (25 ns each)."""
+    model = args[0]
+    substeps = model.method.substeps or int(args[3]["substeps"])
+    points = sum(g.slots * (g.capacity or len(g.a)) for g in model.structure.groups)
+    return steps * substeps * (model.n + points)
 
 
 # --- threads ---

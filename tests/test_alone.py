@@ -116,7 +116,7 @@ def test_bits_depend_neither_on_the_batch_nor_on_cores(restitution, monkeypatch)
         assert same(run(cut(state, rows)), cut((final, traj), rows))
     from rbd_jax import spread
 
-    monkeypatch.setattr(spread, "LEAST_ALONE", 0)
+    monkeypatch.setattr(spread, "LEAST", 0)
     for count in (2, 4):
         monkeypatch.setattr(spread, "cores", lambda count=count: count)
         assert spread._allowed((model, state), 6, STEPS).cores == count
