@@ -16,6 +16,7 @@ from suite import (  # noqa: E402
     cases as all_cases,  # noqa: E402
     engines as all_engines,  # noqa: E402
     judge,
+    measure,
     plan,
     run,
     store,
@@ -203,6 +204,16 @@ def test_a_case_and_an_engine_by_one_file_each(toys, tmp_path):
     assert points["hangs", 0.05]["reason"] == "time limit"
     assert next(r for r in rows if r["kind"] == "refused")["reason"] == "has no drift"
     assert next(r for r in rows if r["kind"] == "job")["status"] == "time limit"
+
+
+def test_a_batch_that_takes_long_is_timed_with_fewer_steps_not_worlds(toys):
+    case = all_cases.load(*toys.case_folders)["drift"]
+    engine = all_engines.load(*toys.engine_folders)["toy"]
+    sweep = measure.Sweep(case, engine, "good", "float64", plan.SUITES["smoke"](case, engine))
+    assert sweep.worlds == 2
+    for cost in (1e-6, 0.1, 10.0):  # seconds of a world and step
+        sweep.cost = cost
+        assert sweep.seconds(0.1, 4, None)[0]["worlds"] == 4
 
 
 def test_an_interrupted_run_goes_on(toys, tmp_path, monkeypatch):

@@ -31,8 +31,8 @@ LIMIT = "limit"
 #: An error from here on is no solution.
 LOST = 1e3
 REPEATS = 4
-#: A call that takes longer [s] is timed with the worlds of the error run.
-LONG = 3.0
+#: The first timed call takes no longer [s], if that leaves it a step.
+LONG = 1.0
 TOO_SLOW = "an error run would take more than {:g} s"
 
 
@@ -119,9 +119,8 @@ class Sweep:
             if self.engine.any_number:
                 if batch > 1:
                     batch = max(2 * (os.cpu_count() or 1), min(batch, int(self.job.time_s / (cost * few))))
-                few = max(min(few, int(self.job.time_s / (cost * batch))), 1)
-            elif cost * batch * few > LONG:
-                batch = min(batch, self.worlds)  # whose program there is already
+            longest = self.job.time_s if self.engine.any_number else LONG
+            few = max(min(few, int(longest / (cost * batch))), 1)
             start = case.start(min(batch, case.worlds)).worlds(batch)
             begin = time.perf_counter()
             call, worlds, steps = simulation.timer(start, few)
