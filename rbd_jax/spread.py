@@ -22,7 +22,7 @@ from .tiles import LANES, alone, filled, flattened, padded, per_world, tiled
 from .xla import on_cpu, waits
 
 #: Work of a call for which threads are worth their start (0.6 ms), see ``work``.
-LEAST = 60_000
+LEAST = 240_000
 
 AXIS = "worlds"
 
@@ -116,11 +116,11 @@ def _allowed(args, worlds: int, steps: int) -> Means:
 
 
 def work(args, steps: int) -> int:
-    """Bodies and points of contact, touching or not, that a world goes through in so many steps (25 ns each)."""
+    """Bodies (5 ns each) and points of contact, touching or not (five times that), that a world goes through."""
     model = args[0]
     substeps = model.method.substeps or int(args[3]["substeps"])
     points = sum(g.slots * (g.capacity or len(g.a)) for g in model.structure.groups)
-    return steps * substeps * (model.n + points)
+    return steps * substeps * (model.n + 5 * points)
 
 
 # --- threads ---

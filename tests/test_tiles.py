@@ -107,7 +107,7 @@ def test_cores_are_used_where_the_work_is_worth_it(monkeypatch):
     assert cores == {"ball": [1, 2], "three balls": [1, 2]}
     model, one = args
     points = sum(g.slots * len(g.a) for g in model.structure.groups)
-    assert spread.work(args, 5) == 5 * 3 * (3 + points) > 0, "three substeps"
+    assert spread.work(args, 5) == 5 * 3 * (3 + 5 * points) > 0, "three substeps"
 
 
 def test_one_program_serves_every_number_of_steps():
