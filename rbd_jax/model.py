@@ -7,6 +7,7 @@ operation in the compiled program; one that it mentions as 0.0 is compiled in.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import math
 
@@ -223,6 +224,17 @@ class Model:
         named = ((name, getattr(self, name)) for name in ("inertia", *BASE_NDIM))
         return [(name, value) for name, value in named if value is not None]
 
+    @functools.cached_property
+    def batched(self) -> tuple[tuple[str, tuple[int, ...]], ...]:
+        """(name, batch axes) of the leaves that have such."""
+        axes = [(name, tuple(value.shape[: value.ndim - self.base_ndim(name)])) for name, value in self.leaves()]
+        return tuple((name, own) for name, own in axes if own)
+
+    @functools.cached_property
+    def with_open_substeps(self) -> Model:
+        """The same, whose method leaves the number of substeps to an argument."""
+        return self._with(method=dataclasses.replace(self.method, substeps=None))
+
     def replace(self, **leaves) -> Model:
         """Return a copy with other numbers; never recompiles unless shapes gain batch axes.
 
@@ -362,10 +374,7 @@ def batch_of(model: Model, batch: tuple[int, ...]) -> tuple[int, ...]:
     Raises:
       ValueError: batch sizes that do not match, naming the leaf.
     """
-    for name, value in model.leaves():
-        own = tuple(value.shape[: value.ndim - model.base_ndim(name)])
-        if not own:
-            continue
+    for name, own in model.batched:
         k = max(len(own), len(batch))
         try:
             batch = np.broadcast_shapes(batch + (1,) * (k - len(batch)), own + (1,) * (k - len(own)))

@@ -9,7 +9,6 @@ are lost from the start are replaced by harmless ones. Its values are those of t
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 import types
@@ -132,14 +131,15 @@ def rollout(
         return _rollout_with(model, state, int(steps), int(every), control, blocks, truncate)
     _check_wrench(model, state, control)
     steps, every = int(steps), int(every)
-    core, args = _forward(model, state, control, steps, every)
+    traced = any_traced((model, state, control))
+    core, args = _forward(model, state, control, steps, every, traced)
     use = means(core, args, batch, steps)
     refuse(state, math.prod(batch), steps // every + 1, 1 + (use.cores > 1), use.devices)
     if use.devices:
         return over_devices(core, use.devices, *args, batch, donate)
     if use.cores > 1:
         return over_cores(core, use.cores, *args, batch)
-    if not any_traced(args):
+    if not traced:
         return (_here_donated if donate else _here)(core, *args)
     changing = first_changing((model, state, control))
     if changing is None:
@@ -496,7 +496,7 @@ def _in_tiles(core, model, state, wrench, counts):
     return tiled(core, model, state, wrench, counts, batch_of(model, state.batch_shape))
 
 
-def _forward(model: Model, state: State, wrench: Wrench | None, steps: int, every: int):
+def _forward(model: Model, state: State, wrench: Wrench | None, steps: int, every: int, traced: bool = False):
     """``core`` and ``args``: ``core(*args)`` is the rollout, not to be differentiated.
 
     Numbers of steps and of substeps are arguments where the call is made rather than traced, so that one program serves
@@ -504,14 +504,14 @@ def _forward(model: Model, state: State, wrench: Wrench | None, steps: int, ever
     turn of a loop whose end it is not told before.
     """
     length, open_ = Length.of(steps, every), {}
-    if on_cpu() and not any_traced((model, state, wrench)):
+    if on_cpu() and not traced:
         if length.every > 1 or length.samples == 1:
             open_["every"] = length.every
         if length.rest is not None:
             open_["rest"] = length.rest
         if model.method.substeps > 1:
             open_["substeps"] = model.method.substeps
-            model = model._with(method=dataclasses.replace(model.method, substeps=None))
+            model = model.with_open_substeps
     core = _core(length._replace(**dict.fromkeys(open_)))
     return core, (model, state, wrench, {name: np.int32(count) for name, count in open_.items()})
 

@@ -87,7 +87,7 @@ def _waits(core, args, batch, use: Means) -> bool:
 
 def any_traced(args) -> bool:
     """Whether a call with these arguments is traced rather than made."""
-    return any(isinstance(c, jax.core.Tracer) for c in jax.tree.leaves(args))
+    return any(issubclass(kind, jax.core.Tracer) for kind in set(map(type, jax.tree.leaves(args))))
 
 
 #: JAX's tracers of derivatives; it does not export all of them. An unknown one costs time to trace, no more.
@@ -96,7 +96,10 @@ CHANGING = ("JVPTracer", "LinearizeTracer")
 
 def first_changing(args) -> int | None:
     """Number of the first leaf of which a derivative is being taken by the innermost transformation; None: of none."""
-    return next((i for i, c in enumerate(jax.tree.leaves(args)) if type(c).__name__ in CHANGING and c.size), None)
+    leaves = jax.tree.leaves(args)
+    if not any(kind.__name__ in CHANGING for kind in set(map(type, leaves))):
+        return None
+    return next((i for i, c in enumerate(leaves) if type(c).__name__ in CHANGING and c.size), None)
 
 
 def _allowed(args, worlds: int, steps: int) -> Means:
