@@ -30,9 +30,9 @@ from .xla import on_cpu, one_function
 TILE = 128
 #: A tile is a multiple of this: no vector loop of XLA leaves a rest that is computed one by one.
 LANES = 32
-#: Operations of a program, and of a part of one that is longer, that become one function. Of many worlds: compiling takes
-#: 3 s; a bin of boxes and balls takes a fifth longer where detection, 2,900 operations, is one. Of few, where to start
-#: kernels costs more than they do: 12 s.
+#: Operations of a program, and of a part of one that is longer, that become one function. Of many worlds: it compiles
+#: in 3 s; a bin of boxes and balls takes a fifth longer where detection, 2,900 operations, is one. Of few, where to
+#: start kernels costs more than they do: 12 s.
 LONGEST, LONGEST_OF_FEW = (4_000, 2_000), (10_000, 6_000)
 
 
