@@ -36,9 +36,14 @@ LANES = 32
 LONGEST, LONGEST_OF_FEW = (4_000, 2_000), (10_000, 6_000)
 
 
-def single(core, worlds: int):
+#: Operations that a group of pairs may add to a program.
+OF_GROUP = 4_000
+
+
+def single(core, worlds: int, model: Model):
     """``core`` as one function, or as few as compile soon."""
-    return one_function(core, *(LONGEST if worlds >= LANES else LONGEST_OF_FEW))
+    longest, part = LONGEST if worlds >= LANES else LONGEST_OF_FEW
+    return one_function(core, longest, part, long=OF_GROUP * len(model.structure.groups) > longest)
 
 
 # --- tiles ---
@@ -105,12 +110,12 @@ def tiled(
             return core(model, state, wrench, counts)
     tiles, width = width_of(worlds, parts, alone(model))
     if tiles * width == worlds and tiles == 1 and parts == 1:
-        return single(core, width)(model, state, wrench, counts)
+        return single(core, width, model)(model, state, wrench, counts)
     args = flattened(model, state, wrench, batch)
     varies = per_world(*args)
     fold = lambda c, b: filled(c, tiles * width).reshape(tiles, width, *c.shape[1:]) if b else c
     args = jax.tree.map(fold, args, varies)
-    run, share = single(core, width), -(-tiles // parts)
+    run, share = single(core, width, model), -(-tiles // parts)
 
     def tile(k):
         at = lambda c, b: jax.lax.dynamic_index_in_dim(c, k, keepdims=False) if b else c

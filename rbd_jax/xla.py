@@ -136,12 +136,13 @@ def _traced_as(kind: str, longest_part: int = 0):
         _longest_part.reset(tokens[1])
 
 
-def one_function(run, longest: int | None = None, longest_part: int = 0):
+def one_function(run, longest: int | None = None, longest_part: int = 0, long: bool = False):
     """``run``, compiled into one function of the CPU where its operations allow it; no effect elsewhere.
 
     XLA's CPU backend otherwise starts a kernel for every few operations, which takes longer than a kernel of a few
     hundred worlds. The time to compile a function grows faster than its length: one of more than ``longest``
-    operations is cut, so that only each ``piece`` of it is one, or each ``part`` of up to ``longest_part``.
+    operations is cut, so that only each ``piece`` of it is one, or each ``part`` of up to ``longest_part``. Where it is
+    likely to be ``long`` the pieces are traced first, as what is traced in vain takes as long as the rest.
 
     Forward only: loops in ``run`` may end early.
 
@@ -154,6 +155,14 @@ def one_function(run, longest: int | None = None, longest_part: int = 0):
     def call(*args):
         if not on_cpu():
             return run(*args)
+        if long:
+            again = lambda *args: run(*args)  # JAX would give this trace of ``run`` itself for that of one function too
+            with _traced_as("pieces", longest_part):
+                traced, shape = jax.make_jaxpr(again, return_shape=True)(*args)
+            length = _length(traced.jaxpr, MARKS)
+            if length is None or length > longest:
+                out = jax.core.eval_jaxpr(traced.jaxpr, traced.consts, *jax.tree.leaves(args))
+                return jax.tree.structure(shape).unflatten(out)
         with _traced_as("one"):
             traced, shape = jax.make_jaxpr(run, return_shape=True)(*args)
         length = _length(traced.jaxpr)
@@ -263,30 +272,36 @@ def _would_be_divided(jaxpr) -> bool:
     return last not in (["while"], ["scan"], ["cond"], ["dynamic_update_slice"])
 
 
-def piece(run, longest: int | None = None):
+def piece(run, longest: int | None = None, long: bool = False):
     """``run(*args)``, one function where the program around it is cut into pieces; else a part of that program."""
 
     def call(*args):
         if _kind.get() != "pieces":
             return run(*args)
         with _traced_as("kernels"):
-            return one_function(run, longest)(*args)
+            return one_function(run, longest, long=long)(*args)
 
     return call
 
 
 def part(run):
     """As ``piece``, of what is itself made of pieces: those are the functions where it is long."""
-    return lambda *args: piece(run, _longest_part.get())(*args)
+    return lambda *args: piece(run, _longest_part.get(), long=True)(*args)
 
 
-def _length(jaxpr) -> int | None:
-    """Operations of a jaxpr with all that it calls; None where one has no place in one function."""
+#: What marks a call as one function.
+MARKS = frozenset({"optimization_barrier", "xla_metadata_value"})
+
+
+def _length(jaxpr, apart: frozenset = frozenset()) -> int | None:
+    """Operations of a jaxpr with all that it calls but those ``apart``; None where one has no place in one function."""
     total = 0
     for e in jaxpr.eqns:
+        if e.primitive.name in apart:
+            continue
         if e.primitive.name not in PLAIN or e.effects:
             return None
-        inside = [_length(j) for j in called(e.params)]
+        inside = [_length(j, apart) for j in called(e.params)]
         if None in inside:
             return None
         total += sum(inside) or 1

@@ -183,6 +183,23 @@ def test_a_long_program_is_cut_into_pieces():
     assert "xla_cpu_small_call" not in jax.jit(part).lower(x).as_text(), "a piece alone is a part of its program"
 
 
+def test_a_program_that_is_likely_long_is_traced_in_pieces_first():
+    """And once only, where it is; what turns out to be short is one function all the same."""
+    count = []
+
+    def run(x):
+        count.append(1)
+        return jax.lax.fori_loop(0, 3, lambda _, y: piece(lambda z: jnp.sin(z) * z)(y) + 1, x), x
+
+    x = jnp.arange(5.0)
+    plain = run(x)
+    for longest, traces in ((2, 1), (100, 2)):
+        count.clear()
+        text = jax.jit(one_function(run, longest, long=True)).lower(x).as_text()
+        assert (len(count), text.count('xla_cpu_small_call = "true"')) == (traces, 1)
+        np.testing.assert_allclose(jax.jit(one_function(run, longest, long=True))(x), plain, rtol=1e-6)
+
+
 def test_an_argument_that_nothing_uses_is_no_trouble():
     call = jax.jit(one_function(lambda x, y: x * 2), keep_unused=True)
     assert float(call(jnp.float32(3), jnp.arange(5.0))) == 6
