@@ -97,9 +97,8 @@ CHANGING = ("JVPTracer", "LinearizeTracer")
 def first_changing(args) -> int | None:
     """Number of the first leaf of which a derivative is being taken by the innermost transformation; None: of none."""
     leaves = jax.tree.leaves(args)
-    if not any(kind.__name__ in CHANGING for kind in set(map(type, leaves))):
-        return None
-    return next((i for i, c in enumerate(leaves) if type(c).__name__ in CHANGING and c.size), None)
+    kinds = {kind for kind in set(map(type, leaves)) if kind.__name__ in CHANGING}
+    return next((i for i, c in enumerate(leaves) if type(c) in kinds and c.size), None)
 
 
 def _allowed(args, worlds: int, steps: int) -> Means:
