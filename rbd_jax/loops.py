@@ -102,8 +102,8 @@ def each_pair(f, matters, *args):
     return over(rows, put, blank)
 
 
-#: Pairs of a block: as many as two or four vectors hold.
-BLOCK = 16
+#: Pairs of a block: as many as one or two vectors hold; with more, a world in which few touch computes more for nothing.
+BLOCK = 8
 
 
 def block_of(width: int) -> int:

@@ -11,6 +11,8 @@ Source: solver order of Moreau-Jean time stepping; the switch is ours.
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -188,8 +190,8 @@ def enter(
     s = model.structure
     state = grown(state, batch)
     one = opaque_one(model.dt)
-    p = params(model, batch, one, substeps)
     hot = to_hot(state, batch)
+    p = params(model, batch, one, substeps)._with(one=one + 0.0 * hot.step.astype(one.dtype))
     memory = hot.memory
     if s.attitude:
         q = hot.q if p.principal is None else hot.q @ p.principal
@@ -394,12 +396,14 @@ def _freeze(old: World, new: World, p: Params) -> tuple[World, jax.Array]:
     Also whether a world made the step, (B,).
     """
     bodies = new.bodies
-    size = sum(c * c for c in jax.tree.leaves(bodies._with(L=None)))
+    squares = [c * c for c in jax.tree.leaves(bodies._with(L=None))]
     if bodies.L is not None:
         moments = p.inertia.moments
         least = moments if p.inertia.isotropic else jnp.minimum(jnp.minimum(moments.x, moments.y), moments.z)
-        size = size + bodies.L.dot(bodies.L) * (1.0 / (least * least))
-    size = materialise(summed(size), p.one)
+        squares.append(bodies.L.dot(bodies.L) * (1.0 / (least * least)))
+    while len(squares) > 1:  # in pairs: of one world the next step waits for the sum, and in a row each for the other
+        squares = [functools.reduce(jnp.add, squares[i : i + 2]) for i in range(0, len(squares), 2)]
+    size = materialise(summed(squares[0]), p.one)
     fits = size <= limit(size.dtype) ** 2  # false for NaN
     ok = fits & ((new.status & jnp.uint32(FROZEN)) == 0)
     status = jnp.where(fits, new.status, new.status | jnp.uint32(FROZEN))
@@ -470,7 +474,7 @@ def _moved(integrator, p: Params, world: World, L, problem: Problem, contacts, s
     v_move = v1 if solution.v_move is None else solution.v_move
     L_move = L1
     if solution.w_move is not None:
-        L_move = p.inertia.momentum(old.q, solution.w_move)
+        L_move = materialise(p.inertia.momentum(old.q, solution.w_move), p.one)
     impacts = _impacts(p, problem, solution, v1) if integrator.order >= 2 else None
     rest, v_rest = solution, v1
     if impacts is not None:
@@ -656,7 +660,7 @@ def _impacts(p: Params, problem: Problem, solution: Solution, v1: Vec3) -> _Impa
         rest, J, late, *turns, couple = by_pair(lambda *args: _impacts_of(problem, v1, *args), rows, lam)
         left.append(rest)
         impulse = spread(impulse, rows, J)
-        shift = spread(shift, rows, late * -1.0)
+        shift = spread(shift, rows, late, -1.0)
         if not spin:
             continue
         turn = _spread_sides(turn, rows, *turns)
@@ -752,4 +756,4 @@ def _power(rows: Rows, lam: Impulses, v: Vec3, w: Vec3 | None, accel: Vec3, left
 def _spread_sides(total: Vec3, rows, b: Vec3, a: Vec3 | None) -> Vec3:
     """``total`` with ``b`` added to body B and ``a`` subtracted from body A."""
     total = add_trees(total, rows.b, b, rows.filled)
-    return total if a is None else add_trees(total, rows.a, a * -1.0, rows.filled)
+    return total if a is None else add_trees(total, rows.a, a, rows.filled, -1.0)

@@ -30,23 +30,35 @@ def opaque_one(x: jax.Array) -> jax.Array:
 def materialise(tree, one: jax.Array | float | None = 1.0):
     """The same values, computed once however many kernels use them (an infinite value becomes NaN).
 
-    ``one`` None leaves the fusion to XLA. A thread of a GPU computes everything once.
-
-    The divisor has the leaf's own shape: XLA turns a division by a broadcast array into a product with
-    its reciprocal, which it duplicates again.
+    ``one``: a number, or an array (B,) with one for each world; None leaves the fusion to XLA. A thread of a GPU
+    computes everything once.
     """
     if one is None or in_a_thread():
         return tree
+    return jax.tree.map(lambda x: x / unit(x, one), tree)
+
+
+def unit(x: jax.Array, one) -> jax.Array:
+    """Ones of the shape of x, which XLA cannot see through.
+
+    Of x's own shape: XLA turns a division by a broadcast array into a product with its reciprocal, which it duplicates
+    again. Where x has one number a world they are ``one`` itself, two operations less.
+    """
+    if jnp.ndim(one):
+        if x.shape[-1:] != one.shape:  # the same for all worlds
+            one = one[0]
+        elif x.size == one.size:
+            return one.reshape(x.shape)
     # ``one`` has no derivative; x loses it before the product, whose tangent would be traced for nothing
-    return jax.tree.map(lambda x: x / (one + 0.0 * jax.lax.stop_gradient(x)), tree)
+    return one + 0.0 * jax.lax.stop_gradient(x)
 
 
 def materialise_linear(tree, like: jax.Array, one):
     """``materialise`` in a way that JAX sees is linear: the divisors are made of ``like``, of the leaves' shape."""
     if in_a_thread():
         return tree
-    unit = jax.lax.stop_gradient(one + 0.0 * like)
-    return jax.tree.map(lambda x: x / unit, tree)
+    ones = jax.lax.stop_gradient(unit(like, one))
+    return jax.tree.map(lambda x: x / ones, tree)
 
 
 @contextlib.contextmanager

@@ -107,15 +107,19 @@ def test_without_contact_no_substeps():
 
 
 def test_bodies_on_static_ground_are_not_coupled():
-    """Many spheres on a plane: the program is that of one, with no gather and no scatter."""
-    many = rbd.Scene(
-        [rbd.Body(f"b{i}", SPHERE, pos=(i, 0, 1), friction=1.0) for i in range(5)],
-        static=[rbd.Plane()],
-        pairs=[rbd.Pair(f"b{i}", f"b{j}", exclude=True) for i in range(5) for j in range(i)],
-    )
+    """Many spheres on a plane: the program is that of two, with no gather and no scatter."""
+
+    def scene(n):
+        return rbd.Scene(
+            [rbd.Body(f"b{i}", SPHERE, pos=(i, 0, 1), friction=1.0) for i in range(n)],
+            static=[rbd.Plane()],
+            pairs=[rbd.Pair(f"b{i}", f"b{j}", exclude=True) for i in range(n) for j in range(i)],
+        )
+
+    ops = step_operations(scene(5))
+    assert names(ops) == names(step_operations(scene(2)))
     one = REDUCED["sphere on a plane"][0]
-    ops = step_operations(many)
-    assert len(ops) <= len(step_operations(one)) + 20  # sums over bodies
+    assert len(ops) <= len(step_operations(one)) + 30  # sums over bodies; of one the divisors are at hand (``xla.unit``)
     assert not {"gather", "scatter", "scatter-add"} & set(names(ops))
 
 

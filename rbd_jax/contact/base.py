@@ -25,7 +25,8 @@ class Pose:
 class Manifold:
     """Contact points between A and B of every pair of one kind.
 
-    normal: unit vector from A to B, leaves (P, B), shared by the slots of a pair.
+    normal: unit vector from A to B, leaves (P, B) or, where it is the same in all worlds, (P, 1); shared by the slots
+      of a pair.
     point: world position, midway between the surfaces [m], leaves (S, P, B).
     distance: signed gap along the normal [m], negative = overlap, (S, P, B).
     live: whether the slot holds a point closer than the margin, bool (S, P, B).

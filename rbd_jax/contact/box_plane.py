@@ -42,7 +42,7 @@ def plane_box(a: Pose, b: Pose, size_a, size_b, margin, one=1.0) -> Manifold:
         at_corners(origin.z, (x.z, y.z, z.z)),
     )
     return Manifold(
-        normal=n.map(lambda c: c + jnp.zeros_like(centre)),
+        normal=n,
         point=point,
         distance=distance,
         live=distance < margin,

@@ -15,4 +15,4 @@ def plane_sphere(a: Pose, b: Pose, size_a, size_b, margin, one=1.0) -> Manifold:
     n = Vec3(2 * (q.x * q.z + q.w * q.y), 2 * (q.y * q.z - q.w * q.x), 1 - 2 * (q.x * q.x + q.y * q.y))
     gap = n.dot(b.x - a.x) - radius
     point = b.x - n * (radius + 0.5 * gap)
-    return one_point(n.map(lambda c: c + jnp.zeros_like(gap)), point, gap, margin)
+    return one_point(n, point, gap, margin)

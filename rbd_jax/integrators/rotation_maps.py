@@ -47,8 +47,9 @@ def half_angle(t) -> tuple[jax.Array, jax.Array]:
     x = 0.25 * (t - _TURN * jnp.round(t * (1.0 / _TURN)))
     n, d = _tangent(x * x)
     n = n * x
-    m = n * n + d * d
-    return (2.0 * n * d) / m, (d * d - n * n) / m
+    nn, dd = n * n, d * d
+    m = nn + dd
+    return (2.0 * n * d) / m, (dd - nn) / m
 
 
 def exp(t: Vec3, scale=1.0) -> Quat:

@@ -25,6 +25,7 @@ import jax.numpy as jnp
 
 from ..bodies import Inertia
 from ..spatial import Quat, Vec3
+from ..xla import materialise_linear
 from .base import Splitting, is_constant
 from .rotation_maps import double, exp, half_angle, norm_correction, spin_x, spin_z
 
@@ -55,9 +56,11 @@ def alternate(q: Quat, p: Vec3, a, b, schedule) -> Quat:
 
 
 def _in_line(q, p, a, b, schedule):
-    for n, fraction in enumerate(schedule):
-        q, p = _about_z(q, p, fraction * a) if n % 2 else _about_x(q, p, fraction * b)
-    return q
+    for n, fraction in enumerate(schedule[:-1]):
+        turned = _about_z(q, p, fraction * a) if n % 2 else _about_x(q, p, fraction * b)
+        # once, not four times for every turn that follows: each component is in all components of the next
+        q, p = materialise_linear(turned, q.w, 1.0)
+    return spin_x(q, *half_angle(schedule[-1] * b * p.x))  # a schedule ends with B
 
 
 def _in_loop(q, p, a, b, schedule):

@@ -22,7 +22,7 @@ import numpy as np
 
 from ..spatial import Mat3, Vec3, components
 from ..struct import static, struct
-from ..xla import materialise, summed
+from ..xla import materialise, summed, unit
 from .base import Problem
 from .matrices import frame, joined, rotated, transposed
 from .rows import Impulses, Index, Rows, add_rows, take, take_tree
@@ -618,8 +618,8 @@ def _small_substitute(factor, b, one):
     entries is made of the factor."""
     low, d = factor
     n = len(b)
-    unit = None if one is None else jax.lax.stop_gradient(one + 0.0 * d[0])
-    keep = lambda x: x if unit is None else x / unit
+    ones = None if one is None else jax.lax.stop_gradient(unit(d[0], one))
+    keep = lambda x: x if ones is None else x / ones
     y = []
     for i in range(n):
         y.append(keep(_sub(b[i], _add(*(_mul(low[i][k], y[k]) for k in range(i))))))
@@ -642,8 +642,8 @@ def _small_general_solve(h, b, one):
             for j in range(k + 1, n):
                 less = _mul(h[i][k], h[k][j])
                 h[i][j] = h[i][j] if less is None else materialise(_sub(h[i][j], less), one)
-    unit = None if one is None else jax.lax.stop_gradient(one + 0.0 * h[0][0])
-    keep = lambda x: x if unit is None else x / unit
+    ones = None if one is None else jax.lax.stop_gradient(unit(h[0][0], one))
+    keep = lambda x: x if ones is None else x / ones
     y = []
     for i in range(n):
         y.append(keep(_sub(b[i], _add(*(_mul(h[i][k], y[k]) for k in range(i))))))

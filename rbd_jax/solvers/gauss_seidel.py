@@ -570,6 +570,7 @@ def _point(pair: Group, at, local, one):
         if spin and va is not None and not rows.central_a:
             j = pair.inertia_a @ ra.cross(n)
             u1, u2 = u1 + ra.cross(t1).dot(j) * dn, u2 + ra.cross(t2).dot(j) * dn
+        u1, u2 = materialise((u1, u2), one)
         l1, l2 = _on_disc((lam.t1, lam.t2), (u1, u2), (mass_1, mass_2), rows.mu * ln, one)
         p = p + t1 * (l1 - lam.t1) + t2 * (l2 - lam.t2)
     p = materialise(p, one)

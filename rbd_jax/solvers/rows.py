@@ -53,7 +53,7 @@ class Rows:
     Attributes:
       a, b: body of each pair: an ``Index`` (static, (P,)) or an int32 array (P, B) that differs from
         world to world; ``a`` is None when the partner is not a body.
-      n: unit normal from A to B, (P, B).
+      n: unit normal from A to B, (P, B), or (P, 1) where it is the same in all worlds.
       ra, rb: arms from the centre of mass to the point [m], (S, P, B).
       phi: signed gap [m], negative = overlap, (S, P, B).
       live: slots that hold a point, bool (S, P, B).
@@ -189,24 +189,32 @@ def add_rows(x: jax.Array, index, values: jax.Array, unique: bool = False) -> ja
     return x.at[index, jnp.arange(x.shape[1])[None, :]].add(values)
 
 
-def add_trees(tree, index, values, filled: jax.Array | None = None):
-    """As ``add_rows`` of every array of ``tree``, in one loop where it is one. filled: pairs from here on are zero."""
+def add_trees(tree, index, values, filled: jax.Array | None = None, sign: float = 1.0):
+    """As ``add_rows`` of every array of ``tree`` and of ``sign`` times the values, in one loop where it is one.
+
+    filled: pairs from here on are zero.
+    """
     fixed = isinstance(index, Index)
     leaves, kind = jax.tree.flatten(tree)
     given = kind.flatten_up_to(values)
     in_order = fixed and len(index) == len(leaves[0]) and np.array_equal(index.rows, np.arange(len(index)))
     if in_one_function() and not in_order and (fixed or index.shape[1] == 1):
         rows = index.rows if fixed else index[:, 0]
-        return kind.unflatten(_added_in_turn(leaves, rows, given, filled))
-    return kind.unflatten([add_rows(x, index, v) for x, v in zip(leaves, given)])
+        return kind.unflatten(_added_in_turn(leaves, rows, given, filled, sign))
+    return kind.unflatten([add_rows(x, index, _times(v, sign)) for x, v in zip(leaves, given)])
 
 
-def _added_in_turn(leaves: list, rows: np.ndarray | jax.Array, values: list, filled=None) -> list:
+def _times(x: jax.Array, sign: float) -> jax.Array:
+    return x if sign == 1.0 else x * sign
+
+
+def _added_in_turn(leaves: list, rows: np.ndarray | jax.Array, values: list, filled=None, sign: float = 1.0) -> list:
     wide = np.broadcast_shapes(*(c.shape[1:] for c in (*leaves, *values)))
     leaves = [jnp.broadcast_to(c, (len(c), *wide)) for c in leaves]
     values = [jnp.broadcast_to(c, (len(rows), *wide)) for c in values]
     rows = jnp.asarray(rows)
-    add_one = lambda k, leaves: [write(x, rows[k], read(x, rows[k]) + read(v, k)) for x, v in zip(leaves, values)]
+    new = lambda x, v, k: write(x, rows[k], read(x, rows[k]) + _times(read(v, k), sign))
+    add_one = lambda k, leaves: [new(x, v, k) for x, v in zip(leaves, values)]
     return repeat(0, len(rows) if filled is None else filled, add_one, leaves)
 
 
@@ -220,7 +228,7 @@ def inverse_inertia(inertia: Inertia, q: Quat) -> InverseInertia:
     return InverseInertia(ax.dot(r.a), bx.dot(r.b), cx.dot(r.c), ax.dot(r.b), ax.dot(r.c), bx.dot(r.c))
 
 
-def spread(total: Vec3, rows: Rows, values: Vec3) -> Vec3:
-    """``total`` (n, B) with pair values (P, B) added to body B and subtracted from body A."""
-    total = add_trees(total, rows.b, values, rows.filled)
-    return total if rows.a is None else add_trees(total, rows.a, values * -1.0, rows.filled)
+def spread(total: Vec3, rows: Rows, values: Vec3, sign: float = 1.0) -> Vec3:
+    """``total`` (n, B) with ``sign`` times pair values (P, B) added to body B and subtracted from body A."""
+    total = add_trees(total, rows.b, values, rows.filled, sign)
+    return total if rows.a is None else add_trees(total, rows.a, values, rows.filled, -sign)

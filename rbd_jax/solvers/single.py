@@ -48,7 +48,7 @@ def solve(problem: Problem, model: ContactModel) -> Solution:
         u = u + take_tree(problem.w, rows.b).cross(r)
     if rows.surface is not None:
         u = u - rows.surface.map(lambda c: c[0])
-    un = n.dot(u)
+    un = materialise(n.dot(u), one)
     mass = jnp.where(live, 1.0, 0.0).astype(un.dtype) / inv_mass
     law = model.law(rows, inv_mass[None], problem)
     soft = mass / (1.0 + law.r[0] * mass) if model.physical and law.r is not None else mass
@@ -66,11 +66,11 @@ def solve(problem: Problem, model: ContactModel) -> Solution:
         bounce = jnp.maximum((events.vhat[0] - un) * mass, 0.0)
         hit = events.active[0]
         moving, end = jnp.where(hit, bounce, moving), jnp.where(hit, bounce, end)
-    end = materialise(end, one)
+    moving, end = materialise((moving, end), one)
     p = n * end
     t1 = t2 = None
     if rows.mu is not None:
-        slip = u - n * un
+        slip = materialise(u - n * un, one)
         a = inv_mass + r.dot(r) * take(problem.inv_inertia.xx, rows.b)
         s2 = slip.dot(slip)
         limit = rows.mu * end
@@ -79,7 +79,6 @@ def solve(problem: Problem, model: ContactModel) -> Solution:
         friction = slip * -materialise(jnp.where(live, scale, 0.0), one)
         t1, t2 = (friction.dot(t)[None] for t in rows.tangents)
         p = p + friction
-    p = materialise(p, one)
     spread = lambda v: Vec3(
         *(add_rows(jnp.zeros_like(z), rows.b, c, unique=True) for z, c in zip(components(problem.v), components(v)))
     )

@@ -110,7 +110,8 @@ uniform float texel;  // of the shadow map [m]
 out vec4 outColour;
 float sun(vec3 p, vec3 n) {
   vec3 c = (lightClip * vec4(p + n * texel * 2.0, 1.0)).xyz * 0.5 + 0.5;
-  if (any(lessThan(c, vec3(0.0))) || any(greaterThan(c, vec3(1.0)))) return 1.0;
+  if (any(lessThan(c.xy, vec2(0.0))) || any(greaterThan(c.xy, vec2(1.0)))) return 1.0;
+  c.z = min(c.z, 1.0);  // a shadow falls on ground that lies behind all that casts one
   vec2 step = 1.4 / vec2(textureSize(shadows, 0));
   float total = 0.0;
   for (int i = -1; i <= 1; i++) for (int j = -1; j <= 1; j++)
