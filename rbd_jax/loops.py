@@ -102,7 +102,7 @@ def each_pair(f, matters, *args):
     return over(rows, put, blank)
 
 
-#: Pairs of a block: as many as one or two vectors hold; with more, a world in which few touch computes more for nothing.
+#: Pairs of a block, one or two vectors: with more, a world in which few touch computes more for nothing.
 BLOCK = 8
 
 

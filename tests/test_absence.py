@@ -119,7 +119,8 @@ def test_bodies_on_static_ground_are_not_coupled():
     ops = step_operations(scene(5))
     assert names(ops) == names(step_operations(scene(2)))
     one = REDUCED["sphere on a plane"][0]
-    assert len(ops) <= len(step_operations(one)) + 30  # sums over bodies; of one the divisors are at hand (``xla.unit``)
+    # sums over bodies; of a single one the divisors are at hand (``xla.unit``)
+    assert len(ops) <= len(step_operations(one)) + 30
     assert not {"gather", "scatter", "scatter-add"} & set(names(ops))
 
 
@@ -155,11 +156,20 @@ def test_nothing_is_stacked_or_indexed_along_components(name, method):
             assert op.outvars[0].aval.shape[axis] in (2, 8, 12), (widths, "only slots may be joined")
 
 
-def test_compiled_flops_stay_near_the_written_ones():
+RECOMPUTED = {
+    "asymmetric free body": 3.4,
+    "sphere on a plane": 4.6,
+    "bouncing sphere on a plane": 3.9,
+    "box on a plane": 2.4,
+}
+
+
+@pytest.mark.parametrize("name", RECOMPUTED)
+def test_compiled_flops_stay_near_the_written_ones(name):
     """XLA recomputes shared producers for every output; a chain that is not materialised shows here."""
-    model, state = rbd.build(REDUCED["box on a plane"][0], method="fast")
+    model, state = rbd.build(REDUCED[name][0], method="fast")
     state = with_memory(model, rbd.batch(state, 8))
     step = jax.jit(lambda m, s: rbd.step(m, s))
     lowered = step.lower(model, state)
     written, compiled = lowered.cost_analysis()["flops"], lowered.compile().cost_analysis()["flops"]
-    assert np.isfinite(compiled) and compiled < 8 * written, compiled / written
+    assert np.isfinite(compiled) and compiled < RECOMPUTED[name] * written, compiled / written

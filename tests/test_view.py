@@ -357,6 +357,23 @@ def test_page_draws_in_chromium(tmp_path, layout):
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs chromium on PATH")
+def test_shadows_on_the_page_are_whole(tmp_path):
+    """Balls high above the ground, whose shadows fall behind all that the light must see."""
+    geoms = [PLANE, *(sphere(k) for k in range(3))]
+    pos = np.array([[[(x, 0.0, z) for x in (-0.6, 0.0, 0.6)] for z in (1.5, 0.3)]])
+    write_html(Clip(geoms, [0.0, 1.0], pos, np.tile([1.0, 0, 0, 0], (1, 2, 3, 1))), tmp_path / "a.html")
+    software = "--use-angle=swiftshader", "--enable-unsafe-swiftshader"
+    picture, said = browse(f"{tmp_path}/a.html#play=0", tmp_path / "a.png", *software)
+    assert said == []
+    scene = picture[150:330].astype(int)
+    dark = (scene.max(-1) < 185) & (np.ptp(scene, axis=-1) < 12)
+    columns = np.flatnonzero(dark.any(0))
+    parts = np.split(columns, np.flatnonzero(np.diff(columns) > 3) + 1)
+    areas = sorted(dark[:, c].sum() for c in parts if len(c) > 5)
+    assert len(areas) == 3 and areas[0] > 0.7 * areas[2], areas
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium on PATH")
 def test_page_without_webgl_says_so(tmp_path):
     write_html(moving(), tmp_path / "a.html")
     command = [CHROMIUM, "--headless=new", "--no-sandbox", "--disable-3d-apis", "--dump-dom"]

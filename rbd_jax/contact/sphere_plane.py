@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
-
 from ..spatial import Vec3
 from .base import Manifold, Pose, one_point
 
