@@ -78,10 +78,12 @@ def advance_to_impacts(
     step = jnp.broadcast_to(p.h, world.step.shape).astype(zero.x.dtype)
     last = jnp.finfo(zero.x.dtype).eps ** 0.5 * step
 
-    def event(bodies, kinematic, left, flight, times):
-        """The first of the impacts at ``times`` (P, B) of every group, in every world that has one."""
+    def event(carry, _):
+        bodies, kinematic, left = carry
         world_now = world._with(bodies=bodies, kinematic=kinematic)
-        hits = [_soonest(t) for t in times]
+        flight = Flight(bodies, a, tau, free)
+        found = jax.lax.stop_gradient((p, pairs, world_now, flight, left - last))
+        hits = [_soonest(_search(model, found[0], g, sel, *found[2:])) for g, sel in zip(groups, found[1])]
         soonest = hits[0][0]
         for t, _ in hits[1:]:
             soonest = jnp.minimum(soonest, t)
@@ -100,27 +102,15 @@ def advance_to_impacts(
         for g, pair, wins in colliding:
             world_now = world._with(bodies=bodies, kinematic=kinematic)
             bodies = _collide(p, g, pair, world_now, flight, wins)
-        return bodies, kinematic, left - t
+        return (bodies, kinematic, left - t), None
 
-    def turn(carry, k):
-        """The next event; after the last one the pairs that meet nevertheless."""
-        now, _ = carry
-        flight, over = Flight(now[0], a, tau, free), k == model.method.events
-        world_now = world._with(bodies=now[0], kinematic=now[1])
-        found = jax.lax.stop_gradient((p, pairs, world_now, flight, now[2] - jnp.where(over, 0.0, last)))
-        times = tuple(_search(model, found[0], g, sel, *found[2:]) for g, sel in zip(groups, found[1]))
-        now = jax.lax.cond(over, lambda: now, lambda: event(*now, flight, times))
-        return (now, tuple(jnp.isfinite(t) for t in times)), None
-
-    shapes = [jnp.broadcast_shapes(_shape(sel, g), step.shape) for g, sel in taking_part]
-    carry = (world.bodies, world.kinematic, step), tuple(jnp.zeros(shape, bool) for shape in shapes)
-    ((bodies, kinematic, left), meets), _ = jax.lax.scan(turn, carry, jnp.arange(model.method.events + 1))
-    meets = iter(meets)
-    return (
-        world._with(bodies=bodies, kinematic=kinematic),
-        left,
-        tuple(None if sel is None else next(meets) for sel in selected),
-    )
+    carry = (world.bodies, world.kinematic, step)
+    (bodies, kinematic, left), _ = jax.lax.scan(event, carry, length=model.method.events)
+    world = world._with(bodies=bodies, kinematic=kinematic)
+    flight = Flight(bodies, a, tau, free)
+    found = jax.lax.stop_gradient((p, selected, world, flight, left))
+    meets = lambda g, sel: None if sel is None else jnp.isfinite(_search(model, found[0], g, sel, *found[2:]))
+    return world, left, tuple(meets(g, sel) for g, sel in zip(model.structure.groups, found[1]))
 
 
 def _instant(model: Model, g: Group):
