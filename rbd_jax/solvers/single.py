@@ -14,7 +14,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from ..spatial import Vec3, components, zeros_like
-from ..xla import materialise
+from ..xla import materialise, materialise_linear
 from .base import Problem, Solution
 from .laws import ContactModel
 from .restitution import targets
@@ -66,11 +66,11 @@ def solve(problem: Problem, model: ContactModel) -> Solution:
         bounce = jnp.maximum((events.vhat[0] - un) * mass, 0.0)
         hit = events.active[0]
         moving, end = jnp.where(hit, bounce, moving), jnp.where(hit, bounce, end)
-    moving, end = materialise((moving, end), one)
+    moving, end = materialise_linear((moving, end), un, one)
     p = n * end
     t1 = t2 = None
     if rows.mu is not None:
-        slip = materialise(u - n * un, one)
+        slip = materialise_linear(u - n * un, un, one)
         a = inv_mass + r.dot(r) * take(problem.inv_inertia.xx, rows.b)
         s2 = slip.dot(slip)
         limit = rows.mu * end
