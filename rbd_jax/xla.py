@@ -35,7 +35,15 @@ def materialise(tree, one: jax.Array | float | None = 1.0):
     """
     if one is None or in_a_thread():
         return tree
-    return jax.tree.map(lambda x: x / unit(x, one), tree)
+    leaves, kind = jax.tree.flatten(tree)
+    first, ones, done = {}, {}, []
+    for x in leaves:
+        like = x.shape, x.dtype
+        if like in first and like not in ones:
+            ones[like] = unit(first[like], one)
+        done.append(x / (ones[like] if like in ones else unit(x, one)))
+        first.setdefault(like, done[-1])
+    return kind.unflatten(done)
 
 
 def unit(x: jax.Array, one) -> jax.Array:

@@ -33,6 +33,7 @@ from ..xla import materialise
 from . import dense
 from .base import Problem, Solution, Solver
 from .dense import Contacts, Sym3, Sym6
+from .joined import join
 from .rows import Impulses, Rows, add_rows, take
 
 #: Bound of the line search [Newton steps].
@@ -72,8 +73,10 @@ class ConeNewton(Solver):
         cs = tuple(dense.contacts(rows, problem) for rows in problem.rows)
         laws = tuple(self.law(c, rows, problem, load) for c, rows, load in zip(cs, problem.rows, problem.loads))
         free = tuple(self.free(c, rows, law, problem) for c, rows, law in zip(cs, problem.rows, laws))
-        system = _System(cs, laws, free, problem.without_rows())
         start = tuple(_masked(c, warm) for c, warm in zip(cs, problem.warm))
+        cs, trees, joint = join(cs, tuple(zip(laws, free, start)), problem.v.x.shape[0], problem.one)
+        laws, free, start = zip(*trees)
+        system = _System(cs, laws, free, problem.without_rows())
 
         solution = implicit.root(
             lambda args: self._search_minimum(*args),
@@ -82,7 +85,8 @@ class ConeNewton(Solver):
         )
         p = materialise(solution((system, start)), problem.one)
         impulse, turn = dense.on_bodies(cs, p, problem)
-        return Solution(impulse=impulse, angular_impulse=turn, contacts=p, unconverged=_unconverged(system, p))
+        unconverged = _unconverged(system, p)
+        return Solution(impulse=impulse, angular_impulse=turn, contacts=joint.split(p), unconverged=unconverged)
 
     def _search_minimum(self, system: _System, start):
         """Newton's method with an exact line search; returns the impulses."""

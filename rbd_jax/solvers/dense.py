@@ -16,15 +16,18 @@ torque-spin, and K = sum F, C = sum [r]x F + X', W = sum [r]x F [r]x' + [r]x X +
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..loops import repeat
 from ..spatial import Mat3, Vec3, components
 from ..struct import static, struct
-from ..xla import materialise, summed, unit
+from ..xla import materialise, materialise_linear, on_cpu, one_function, summed, unit
 from .base import Problem
-from .matrices import frame, joined, rotated, transposed
+from .matrices import vector
 from .rows import Impulses, Index, Rows, add_rows, take, take_tree
 
 
@@ -98,6 +101,8 @@ class Contacts:
 
     n, t1, t2: the frame in world axes, (P, B). ra, rb: arms in the frame, (S, P, B), None without
     attitude. a, b: as in ``Rows``. friction, torsion, rolling: which rows there are beside the normal one.
+    shapes: (S, P) of the groups of which this one is joined (``joined``), whose points are those of the groups one
+    after the other, (1, K, B); anchored: some of its bodies A are number n, which does not move.
     """
 
     n: Vec3
@@ -111,6 +116,38 @@ class Contacts:
     friction: bool = static(default=True)
     torsion: bool = static(default=False)
     rolling: bool = static(default=False)
+    shapes: tuple = static(default=())
+    anchored: bool = static(default=False)
+    jacobian: dict | None = None
+
+    @property
+    def point_shapes(self) -> tuple:
+        """(S, P) of the groups of pairs that have equally many points each."""
+        return self.shapes or (self.live.shape[:2],)
+
+    def to_points(self, tree):
+        """Of arrays (P, B) of the pairs those of the points: arrays that broadcast to (S, P, B)."""
+        if not self.shapes:
+            return tree
+        return jax.tree.map(lambda x: take(x, pair_of_point(self.shapes))[None], tree)
+
+    def by_group(self, x) -> list:
+        """Of an array (..., S, P, m, B) those of the pairs that have equally many points, pair after pair."""
+        if not self.shapes:
+            return [x]
+        starts = np.cumsum([0, *(s * p for s, p in self.shapes)])
+        cut = lambda at, s, p: x[..., 0, at : at + s * p, :, :].reshape(*x.shape[:-4], s, p, *x.shape[-2:])
+        return [cut(at, s, p) for at, (s, p) in zip(starts, self.shapes)]
+
+    def over_points(self, entries: list, one) -> list:
+        """The sums over the points of every pair, (P, B), of arrays (S, P, B); None for None. Linear, for JAX too."""
+        if not self.shapes:
+            return [_slots(x) for x in entries]
+        some = vector([x[0] for x in entries if x is not None])[None]
+        sums = jnp.concatenate([summed(x) for x in self.by_group(some)])
+        sums = [sums[:, i] for i in range(sums.shape[1])]
+        sums = iter(materialise_linear(sums, self.n.x, one))
+        return [None if x is None else next(sums) for x in entries]
 
     def turn(self, v: Vec3) -> Vec3:
         """World components -> contact frame; the tangential ones are None where nothing uses them."""
@@ -123,6 +160,13 @@ class Contacts:
         """Rows are world axes, columns the contact frame."""
         n, a, b = self.n, self.t1, self.t2
         return Mat3(Vec3(a.x, b.x, n.x), Vec3(a.y, b.y, n.y), Vec3(a.z, b.z, n.z))
+
+
+@functools.lru_cache(maxsize=256)
+def pair_of_point(shapes: tuple) -> Index:
+    """The pair of every point of a joined group."""
+    pairs = np.cumsum([0, *(p for _, p in shapes)])
+    return Index(np.concatenate([at + np.tile(np.arange(p), s) for at, (s, p) in zip(pairs, shapes)]))
 
 
 def contacts(rows: Rows, problem: Problem) -> Contacts:
@@ -150,7 +194,11 @@ def row_dot(p: Impulses, u: Impulses) -> jax.Array:
 
 def ends(c: Contacts, v: Vec3, w: Vec3 | None) -> list:
     """(v, w) of body B of every pair, and of body A where there is one, (P, B)."""
-    return [(take_tree(v, i), None if w is None else take_tree(w, i)) for i in (c.b, c.a) if i is not None]
+    one = lambda i, v, w: (take_tree(v, i), None if w is None else take_tree(w, i))
+    if c.a is None:
+        return [one(c.b, v, w)]
+    rest = lambda x: jnp.pad(x, ((0, 1), (0, 0))) if c.anchored else x
+    return [one(c.b, v, w), one(c.a, *jax.tree.map(rest, (v, w)))]
 
 
 def at_points(c: Contacts, v: Vec3, w: Vec3 | None) -> Impulses:
@@ -162,10 +210,10 @@ def between(c: Contacts, bodies) -> Impulses:
     """Relative velocity of every slot, of the velocities of ``ends``."""
 
     def side(body, r):
-        u = c.turn(body[0])
+        u = c.to_points(c.turn(body[0]))
         if r is None:
             return u
-        s = c.turn(body[1])
+        s = c.to_points(c.turn(body[1]))
         z = u.z + (s.x * r.y - s.y * r.x)
         if not c.friction:
             return Vec3(None, None, z)
@@ -178,7 +226,8 @@ def between(c: Contacts, bodies) -> Impulses:
     full = lambda x: jnp.broadcast_to(x, jnp.broadcast_shapes(x.shape, c.live.shape))
     if not c.friction:
         return Impulses(full(u.z))
-    return Impulses(full(u.z), full(u.x), full(u.y), *map(full, _angular(c, _relative_spin(c, bodies))))
+    angular = c.to_points(_angular(c, _relative_spin(c, bodies)))
+    return Impulses(full(u.z), full(u.x), full(u.y), *map(full, angular))
 
 
 def _relative_spin(c: Contacts, bodies) -> Vec3 | None:
@@ -208,36 +257,43 @@ def relative(c: Contacts, rows: Rows, v: Vec3, w: Vec3 | None) -> Impulses:
 
 def on_bodies(cs, ps, problem: Problem) -> tuple[Vec3, Vec3 | None]:
     """Total impulse and angular impulse J' p on every body, (n, B), from slot impulses of all groups."""
-    zero = jnp.zeros((problem.v.x.shape[0], cs[0].live.shape[-1]), problem.v.x.dtype)
+    n = problem.v.x.shape[0]
+    anchored = any(c.anchored for c in cs)
+    zero = jnp.zeros((n + anchored, cs[0].live.shape[-1]), problem.v.x.dtype)
     force = Vec3(zero, zero, zero)
     torque = None if problem.w is None else force
     for c, p in zip(cs, ps):
-        world, turns = on_pair(c, p)
+        world, turns = on_pair(c, p, problem.one)
         for index, turn, sign in zip((c.b, c.a), turns, (1.0, -1.0)):
             force = _scatter(force, index, world * sign)
             if turn is not None:
                 torque = _scatter(torque, index, turn * sign)
-    return force, torque
+    return jax.tree.map(lambda x: x[:n], (force, torque)) if anchored else (force, torque)
 
 
-def on_pair(c: Contacts, p: Impulses) -> tuple[Vec3, list]:
+def on_pair(c: Contacts, p: Impulses, one) -> tuple[Vec3, list]:
     """Impulse on body B of every pair, and the angular impulses [on B, minus that on A] (None: no arm), (P, B)."""
-    world = c.n * summed(p.n)
-    if c.friction:
-        world = world + c.t1 * summed(p.t1) + c.t2 * summed(p.t2)
-    turns = []
-    for r in (c.rb,) if c.a is None else (c.rb, c.ra):
+    arms = (c.rb,) if c.a is None else (c.rb, c.ra)
+    entries = [p.t1, p.t2, p.n] if c.friction else [None, None, p.n]
+    for r in arms:
         if r is None:
-            turns.append(None)
+            entries += [None] * 3
             continue
-        x, y = r.y * p.n, -r.x * p.n
+        x, y, z = r.y * p.n, -r.x * p.n, None
         if c.friction:
-            x, y = x - r.z * p.t2, y + r.z * p.t1
-        turn = c.t1 * summed(_add(x, p.r1)) + c.t2 * summed(_add(y, p.r2))
-        if c.friction:
-            turn = turn + c.n * summed(_add(r.x * p.t2 - r.y * p.t1, p.s))
-        turns.append(turn)
-    return world, turns
+            x, y, z = x - r.z * p.t2, y + r.z * p.t1, r.x * p.t2 - r.y * p.t1
+        entries += [_add(x, p.r1), _add(y, p.r2), _add(z, p.s)]
+    t1, t2, n, *turns = c.over_points(entries, one)
+    world = c.n * n
+    if c.friction:
+        world = world + c.t1 * t1 + c.t2 * t2
+
+    def turn(x, y, z):
+        total = c.t1 * x + c.t2 * y
+        return total if z is None else total + c.n * z
+
+    turns = [turns[i : i + 3] for i in range(0, len(turns), 3)]
+    return world, [None if x is None else turn(x, y, z) for x, y, z in turns]
 
 
 def response(problem: Problem, impulse: Vec3, turn: Vec3 | None) -> tuple[Vec3, Vec3 | None]:
@@ -317,31 +373,22 @@ def _uncoupled(cs, gs, rhs, problem: Problem):
 
 def _coupled(cs, gs, rhs, problem: Problem):
     """One dense system a world: (B, N, N), N = 6 n or, without attitude, 3 n."""
-    one = problem.one
     n, worlds = rhs[0].x.shape
     spin = any(c.rb is not None for c in cs)
     size = 6 if spin else 3
-    zero = jnp.zeros((n, worlds), rhs[0].x.dtype)
-    own = _own_block(problem, zero + 1.0 / problem.inv_mass, spin)
-    body = np.arange(n, dtype=np.int32)
-    h = jnp.zeros((n, n, size, size, worlds), zero.dtype)
-    h = h.at[body, body].add(_stack(own, n, worlds, zero.dtype), unique_indices=True)
-    batch_first = [c for c in cs if not isinstance(c.b, Index)]
-    fixed = [(c, g) for c, g in zip(cs, gs) if isinstance(c.b, Index)]
-    for c, g in fixed:
-        for p, q, block in _pair_blocks(c, g, one, size):
-            h = h.at[p.rows, q.rows].add(jnp.broadcast_to(block, (len(p), size, size, worlds)))
-    h = jnp.transpose(h, (4, 0, 1, 2, 3))  # (B, n, n, size columns, size rows)
-    if batch_first:
-        world = jnp.arange(worlds)[None, :]
-        for c, g in zip(cs, gs):
-            if isinstance(c.b, Index):
-                continue
-            for p, q, block in _pair_blocks(c, g, one, size):
-                x = jnp.broadcast_to(block, (p.shape[0], size, size, worlds))
-                h = h.at[world, p, q].add(jnp.transpose(x, (0, 3, 1, 2)))
-    h = jnp.transpose(h, (0, 1, 4, 2, 3)).reshape(worlds, n * size, n * size)
-    b = jnp.stack(components(rhs[0]) + (components(rhs[1]) if spin else ()), axis=1)  # (n, size, B)
+    rows = n + any(c.anchored for c in cs)
+    own = _own_blocks(problem, n, worlds, spin)
+    h = jnp.zeros((rows * rows, worlds, size, size), rhs[0].x.dtype)
+    h = add_rows(h, Index(np.arange(n) * (rows + 1)), own, unique=True)
+    for c, g in zip(cs, gs):
+        for p, q, block in _pair_blocks(c, g, problem.one, size):
+            if isinstance(p, Index):
+                h = add_rows(h, Index(p.rows * rows + q.rows), block)
+            else:
+                h = h.at[p * rows + q, jnp.arange(worlds)[None, :]].add(block)
+    h = h.reshape(rows, rows, worlds, size, size)[:n, :n]
+    h = jnp.transpose(h, (2, 0, 3, 1, 4)).reshape(worlds, n * size, n * size)
+    b = vector(components(rhs[0]) + (components(rhs[1]) if spin else ()))  # (n, size, B)
     solve = _dense_general_solve if any(isinstance(g, Lagging) for g in gs) else _dense_solve
     x = solve(h, jnp.transpose(b, (2, 0, 1)).reshape(worlds, n * size))
     x = jnp.transpose(x.reshape(worlds, n, size), (2, 1, 0))
@@ -363,29 +410,104 @@ def _own_block(problem: Problem, mass, spin: bool) -> list:
     return own
 
 
+def _own_blocks(problem: Problem, n: int, worlds: int, spin: bool):
+    """M of every body, (n, B, size, size)."""
+    diagonal = lambda x: jnp.broadcast_to(x, (n, worlds))[..., None, None] * np.eye(3, dtype=x.dtype)
+    mass = diagonal(1.0 / problem.inv_mass)
+    if not spin:
+        return mass
+    low = world_inertia(problem)
+    if problem.inertia.isotropic:
+        inertia = diagonal(low[0][0])
+    else:
+        entries = [low[max(i, j)][min(i, j)] for i in range(3) for j in range(3)]
+        inertia = jnp.moveaxis(vector([jnp.broadcast_to(x, (n, worlds)) for x in entries]), 1, 2)
+        inertia = inertia.reshape(n, worlds, 3, 3)
+    pad = lambda m, low, high: jnp.pad(m, ((0, 0), (0, 0), (low, high), (low, high)))
+    return pad(mass, 0, 3) + pad(inertia, 3, 0)
+
+
 def _pair_blocks(c: Contacts, g: Sym3 | Sym6 | Lagging, one, size: int):
-    """(body row, body column, block) of every block of J' G J of one group; blocks (P, size columns, size rows, B)."""
-    q = frame(c.t1, c.t2, c.n, one)
-    turn = lambda m: rotated(q, materialise(m, one), one)
-    symmetric = not isinstance(g, Lagging)
-    ends = [(c.b, c.rb)] if c.a is None else [(c.b, c.rb), (c.a, c.ra)]
-    force = turn(_force_velocity(g))
-    if c.rb is None:
-        fill = (0, size - 3)
-        force = jnp.pad(force, ((0, 0), fill, fill, (0, 0)))
-        for row, _ in ends:
-            for column, _ in ends:
-                yield row, column, force if row is column else -force
-        return
-    lower = [turn(_torque_velocity(g, r)) for _, r in ends]
-    upper = [transposed(m) for m in lower] if symmetric else [turn(_force_spin(g, r)) for _, r in ends]
-    spin = {}
-    for i, (row, left) in enumerate(ends):
-        for j, (column, right) in enumerate(ends):
-            known = symmetric and (j, i) in spin
-            spin[i, j] = transposed(spin[j, i]) if known else turn(_torque_spin(g, left, right))
-            block = joined(force, lower[i], upper[j], spin[i, j])
-            yield row, column, block if i == j else -block
+    """(body row, body column, block) of every block of J' G J of one group; blocks (P, B, size rows, size columns).
+
+    Columns of a row are an array, which is several times fewer operations than entry by entry: they are what a program
+    takes its time to compile for. Sums over points are written out: XLA's own, and its products of small matrices, take
+    four to eight times as long.
+    """
+    rows, entries, shapes = c.jacobian, _entries(g), c.point_shapes
+    flat = lambda x: jnp.broadcast_to(x, c.live.shape).reshape(-1, c.live.shape[-1])
+    turned = {i: _add(*(flat(entries[i, k]) * rows[k] for k in rows if (i, k) in entries)) for i in rows}
+    turned = materialise(turned, one)
+
+    def product(names, start: int, stop: int):
+        """Sum of row x turned row over these rows of the points from ``start`` on, (columns, columns, P, B)."""
+        cut = lambda x: jax.lax.slice_in_dim(x, start, stop, axis=1)
+        outer = lambda x, y: cut(x)[:, None] * cut(y)[None]
+        return [outer(rows[name], turned[name]) for name in names]
+
+    # columns (spin of A,) velocity(, spin of B): those of A in the order of the others
+    of_a = (lambda x, *axes: jnp.roll(x, 3, axes)) if size == 6 else lambda x, *axes: x
+    at = pair = 0
+    for s, p in shapes:
+        h = materialise(_add(*(x for k in range(s) for x in product(rows, at + k * p, at + (k + 1) * p))), one)
+        h = jnp.transpose(h, (2, 3, 0, 1))
+        a, b = (i if i is None else _cut(i, pair, pair + p) for i in (c.a, c.b))
+        yield b, b, h[:, :, -size:, -size:]
+        if a is not None:
+            yield a, a, of_a(h[:, :, :size, :size], 2, 3)
+            yield a, b, -of_a(h[:, :, :size, -size:], 2)
+            yield b, a, -of_a(h[:, :, -size:, :size], 3)
+        at, pair = at + s * p, pair + p
+
+
+def _cut(index, start: int, stop: int):
+    return Index(index.rows[start:stop]) if isinstance(index, Index) else index[start:stop]
+
+
+def jacobian(c: Contacts, size: int, one) -> dict:
+    """The rows of J of all points by name, (columns, K, B): derivatives of a relative velocity by the velocity and the
+    spin of body B, and before them, with the opposite sign, by the spin of A.
+    """
+    worlds = c.live.shape[-1]
+    of_point = pair_of_point(c.point_shapes).rows
+    axis = lambda v: None if v is None else jnp.stack(jnp.broadcast_arrays(*components(v)))[:, of_point]
+    t1, t2, n = (axis(v) for v in (c.t1, c.t2, c.n))
+    axes = {"n": n} if t1 is None else {"t1": t1, "t2": t2, "n": n}
+    full = lambda x: jnp.broadcast_to(x, (3, len(of_point), worlds))
+    none = jnp.zeros((3, len(of_point), worlds), c.n.x.dtype)
+
+    def turns(r: Vec3 | None) -> dict:
+        """r x axis of every axis."""
+        if r is None:
+            return {}
+        x, y, z = (jnp.broadcast_to(q, c.live.shape).reshape(-1, worlds) for q in components(r))
+        about_n = {"n": full(t1 * y - t2 * x)}
+        return {"t1": full(t2 * z - n * y), "t2": full(n * x - t1 * z)} | about_n if c.friction else about_n
+
+    arms = [] if size == 3 else [turns(c.rb)] if c.a is None else [turns(c.ra), turns(c.rb)]
+    row = lambda velocity, spins: jnp.concatenate([*spins[:-1], velocity, *spins[-1:]])
+    linear = ("t1", "t2", "n") if c.friction else ("n",)
+    rows = {name: row(full(axes[name]), [arm.get(name, none) for arm in arms]) for name in linear}
+    if c.torsion:
+        angular = {"s": "n"} | ({"r1": "t1", "r2": "t2"} if c.rolling else {})
+        rows |= {name: row(none, [full(axes[axis])] * len(arms)) for name, axis in angular.items()}
+    return materialise(rows, one)
+
+
+def _entries(g: Sym3 | Sym6 | Lagging) -> dict:
+    """The entries of G by the names of row and column; what is missing is zero."""
+    force, cross, torque, column = _split(g)
+    linear, angular = ("t1", "t2", "n"), ("r1", "r2", "s")
+    entries = {}
+    for i in range(3):
+        for j in range(3):
+            entries[linear[i], linear[j]] = force[i][j]
+            entries[angular[i], angular[j]] = torque[i][j]
+            entries[linear[i], angular[j]] = entries[angular[j], linear[i]] = cross[i][j]
+    if column is not None:
+        for name in FRICTION:
+            entries[name, "n"] = _add(entries[name, "n"], getattr(column, name))
+    return {names: x for names, x in entries.items() if x is not None}
 
 
 def _own_pair_block(c: Contacts, g: Sym3 | Sym6 | Lagging, one, size: int) -> list:
@@ -534,14 +656,6 @@ def components_rows(m: Mat3) -> tuple[Vec3, Vec3, Vec3]:
     return m.a, m.b, m.c
 
 
-def _stack(m, pairs: int, worlds: int, dtype):
-    """(pairs, size, size, B) array from nested lists of (pairs, B or 1) arrays or None."""
-    zero = jnp.zeros((pairs, worlds), dtype)
-    full = lambda x: zero if x is None else jnp.broadcast_to(x, zero.shape)
-    flat = jnp.stack([full(x) for row in m for x in row], axis=1)
-    return flat.reshape(pairs, len(m), len(m), worlds)
-
-
 def _scatter(total: Vec3, index, v: Vec3) -> Vec3:
     return Vec3(*(add_rows(x, index, y) for x, y in zip(components(total), components(v))))
 
@@ -566,7 +680,28 @@ def _dense_solve_jvp(primals, tangents):
 @jax.custom_jvp
 def _dense_general_solve(h, b):
     """h^-1 b for any h (B, N, N), b (B, N)."""
-    return jnp.linalg.solve(h, b[..., None])[..., 0]
+    lu, pivots, order = jax.lax.linalg.lu(h)
+    if on_cpu():  # there JAX makes the order of the rows in a loop of N turns of eight kernels: half of the time
+        order = one_function(_order)(pivots)
+    solve = functools.partial(jax.lax.linalg.triangular_solve, lu, left_side=True)
+    y = solve(jnp.take_along_axis(b, order, axis=1)[..., None], lower=True, unit_diagonal=True)
+    return solve(y, lower=False)[..., 0]
+
+
+def _order(pivots):
+    """The order of the rows of (B, N) matrices of which row k was exchanged with row pivots[k], one after the other."""
+    worlds, n = pivots.shape
+    read = lambda x, *at: jax.lax.dynamic_slice(x, at, (1, 1))
+
+    def exchange(world, k, order):
+        other = read(pivots, world, k)[0, 0]
+        mine, its = read(order, world, k), read(order, world, other)
+        order = jax.lax.dynamic_update_slice(order, its, (world, k))
+        return jax.lax.dynamic_update_slice(order, mine, (world, other))
+
+    rows = jax.lax.broadcasted_iota(pivots.dtype, pivots.shape, 1)
+    of_world = lambda world, order: repeat(0, n, lambda k, order: exchange(world, k, order), order)
+    return repeat(0, worlds, of_world, rows)
 
 
 @_dense_general_solve.defjvp

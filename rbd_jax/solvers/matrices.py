@@ -49,10 +49,3 @@ def rotated(q, m, one):
         part = materialise(half, one)[:, None] * across(q[j])
         total = part if total is None else total + part
     return materialise(total, one)
-
-
-def joined(force, lower, upper, spin):
-    """[[force, upper], [lower, spin]], (P, 6, 6, B)."""
-    force, lower, upper, spin = jnp.broadcast_arrays(force, lower, upper, spin)
-    left, right = (jnp.concatenate(x, axis=2) for x in ((force, lower), (upper, spin)))
-    return jnp.concatenate([left, right], axis=1)

@@ -57,6 +57,7 @@ from ..xla import loops_are_cheap, materialise, materialise_linear, piece
 from . import dense, newton_loop
 from .base import Problem, Solution, Solver
 from .dense import Contacts, Lagging, Sym3, Sym6
+from .joined import join
 from .laws import Law, contact_model
 from .laws.base import points
 from .laws.near_rigid import convex
@@ -108,7 +109,7 @@ class NewtonLagged(Solver):
             return self._closed_form(problem)
         if self._loops(problem):
             return self._in_loops(problem)
-        system, start = self._system(problem)
+        system, start, joint = self._system(problem)
         if self.smoothing == "backward":
             soft, system = system, system._with(smooth=None)
             p, bound = (self._closed_form(problem).contacts, None) if closed else self._found(system, start)
@@ -120,7 +121,7 @@ class NewtonLagged(Solver):
         return Solution(
             impulse=impulse,
             angular_impulse=turn,
-            contacts=p,
+            contacts=joint.split(p),
             unconverged=None if bound is None else self._unconverged(system, bound, p),
             warm=not closed,
         )
@@ -150,7 +151,7 @@ class NewtonLagged(Solver):
         return c, law, free, _start(c, warm), _bound(law, warm.n, free)
 
     def _system(self, problem: Problem):
-        """What the rows depend on, and the impulses and bounds of friction to start from."""
+        """What the rows depend on, the impulses and bounds of friction to start from, and whose they are."""
         cs = tuple(dense.contacts(rows, problem) for rows in problem.rows)
         free = tuple(dense.relative(c, rows, problem.v, problem.w) for c, rows in zip(cs, problem.rows))
         groups = zip(cs, problem.rows, problem.loads)
@@ -162,7 +163,9 @@ class NewtonLagged(Solver):
             if problem.smoothing is None:
                 raise ValueError("NewtonLagged.smoothing needs the numbers Problem.smoothing")
             smooth = problem.smoothing
-        return _System(cs, laws, free, problem.without_rows(), smooth), (p, bound)
+        cs, trees, joint = join(cs, tuple(zip(laws, free, p, bound)), problem.v.x.shape[0], problem.one)
+        laws, free, p, bound = zip(*trees)
+        return _System(cs, laws, free, problem.without_rows(), smooth), (p, bound), joint
 
     def _found(self, system: _System, start):
         """Impulses, and the bound of their friction."""

@@ -34,6 +34,7 @@ class Index:
 
     def __init__(self, rows):
         self.rows = np.asarray(rows, np.int32)
+        self.column = self.rows[:, None]  # one object: what a loop closes over is one array then
         self._hash = hash(self.rows.tobytes())
 
     def __hash__(self):
@@ -165,10 +166,31 @@ def take(x: jax.Array, index) -> jax.Array:
             return x
         if len(rows) and np.array_equal(rows, np.arange(rows[0], rows[0] + len(rows))):
             return x[int(rows[0]) : int(rows[0]) + len(rows)]
-        return x[rows]
+        return _gathered(x, index.column)
     if x.shape[1] == 1:
         return x[:, 0][index]
     return jnp.take_along_axis(x, index, axis=0)
+
+
+# ``x[rows]`` and ``x.at[rows].add`` come with the arithmetic of negative and of too large rows: some ten operations
+# instead of one, for each component of each group, and again in every derivative.
+
+
+def _gathered(x: jax.Array, column: np.ndarray) -> jax.Array:
+    """x[rows], rows as a ``column`` (P, 1)."""
+    numbers = jax.lax.GatherDimensionNumbers(tuple(range(1, x.ndim)), (0,), (0,))
+    return jax.lax.gather(x, column, numbers, (1, *x.shape[1:]), mode="promise_in_bounds")
+
+
+def _scatter_added(x: jax.Array, column: np.ndarray, values: jax.Array, unique: bool) -> jax.Array:
+    """x.at[rows].add(values), rows as a ``column`` (P, 1)."""
+    shape = np.broadcast_shapes(x.shape[1:], values.shape[1:])
+    x = jnp.broadcast_to(x, (len(x), *shape))
+    values = jnp.broadcast_to(values, (len(column), *shape))
+    numbers = jax.lax.ScatterDimensionNumbers(tuple(range(1, x.ndim)), (0,), (0,))
+    return jax.lax.scatter_add(
+        x, column, values, numbers, unique_indices=unique, mode="promise_in_bounds"
+    )
 
 
 def take_tree(tree, index):
@@ -183,7 +205,7 @@ def add_rows(x: jax.Array, index, values: jax.Array, unique: bool = False) -> ja
             return x + values
         if in_one_function():
             return _added_in_turn([x], rows, [values])[0]
-        return x.at[rows].add(values, unique_indices=unique)
+        return _scatter_added(x, index.column, values, unique)
     if in_one_function() and x.shape[1] == 1:
         return _added_in_turn([x], index[:, 0], [values])[0]
     return x.at[index, jnp.arange(x.shape[1])[None, :]].add(values)
