@@ -131,21 +131,20 @@ class Contacts:
             return tree
         return jax.tree.map(lambda x: take(x, pair_of_point(self.shapes))[None], tree)
 
-    def by_group(self, x) -> list:
-        """Of an array (..., S, P, m, B) those of the pairs that have equally many points, pair after pair."""
-        if not self.shapes:
-            return [x]
-        starts = np.cumsum([0, *(s * p for s, p in self.shapes)])
-        cut = lambda at, s, p: x[..., 0, at : at + s * p, :, :].reshape(*x.shape[:-4], s, p, *x.shape[-2:])
-        return [cut(at, s, p) for at, (s, p) in zip(starts, self.shapes)]
+    def by_point(self, x) -> list:
+        """Of an array (m, K, B) of all points, group after group, the lists of those (m, P, B) of its slots."""
+        cut, starts = jax.lax.slice_in_dim, np.cumsum([0, *(s * p for s, p in self.point_shapes)])
+        slots = lambda at, s, p: [cut(x, at + k * p, at + (k + 1) * p, axis=1) for k in range(s)]
+        return [slots(int(at), s, p) for at, (s, p) in zip(starts, self.point_shapes)]
 
     def over_points(self, entries: list, one) -> list:
         """The sums over the points of every pair, (P, B), of arrays (S, P, B); None for None. Linear, for JAX too."""
         if not self.shapes:
             return [_slots(x) for x in entries]
-        some = vector([x[0] for x in entries if x is not None])[None]
-        sums = jnp.concatenate([summed(x) for x in self.by_group(some)])
-        sums = [sums[:, i] for i in range(sums.shape[1])]
+        starts = np.cumsum([0, *(s * p for s, p in self.shapes)])
+        part = lambda x, at, s, p: jax.lax.slice_in_dim(x[0], at, at + s * p).reshape(s, p, -1)
+        of_group = lambda x: [summed(part(x, int(at), s, p)) for at, (s, p) in zip(starts, self.shapes)]
+        sums = [jnp.concatenate(of_group(x)) for x in entries if x is not None]
         sums = iter(materialise_linear(sums, self.n.x, one))
         return [None if x is None else next(sums) for x in entries]
 
@@ -434,30 +433,24 @@ def _pair_blocks(c: Contacts, g: Sym3 | Sym6 | Lagging, one, size: int):
     takes its time to compile for. Sums over points are written out: XLA's own, and its products of small matrices, take
     four to eight times as long.
     """
-    rows, entries, shapes = c.jacobian, _entries(g), c.point_shapes
+    rows, entries = c.jacobian, _entries(g)
     flat = lambda x: jnp.broadcast_to(x, c.live.shape).reshape(-1, c.live.shape[-1])
     turned = {i: _add(*(flat(entries[i, k]) * rows[k] for k in rows if (i, k) in entries)) for i in rows}
     turned = materialise(turned, one)
-
-    def product(names, start: int, stop: int):
-        """Sum of row x turned row over these rows of the points from ``start`` on, (columns, columns, P, B)."""
-        cut = lambda x: jax.lax.slice_in_dim(x, start, stop, axis=1)
-        outer = lambda x, y: cut(x)[:, None] * cut(y)[None]
-        return [outer(rows[name], turned[name]) for name in names]
-
+    outer = lambda x, y: x[:, None] * y[None]
     # columns (spin of A,) velocity(, spin of B): those of A in the order of the others
     of_a = (lambda x, *axes: jnp.roll(x, 3, axes)) if size == 6 else lambda x, *axes: x
-    at = pair = 0
-    for s, p in shapes:
-        h = materialise(_add(*(x for k in range(s) for x in product(rows, at + k * p, at + (k + 1) * p))), one)
+    start = 0
+    for group in zip(*(zip(c.by_point(rows[name]), c.by_point(turned[name])) for name in rows)):
+        h = materialise(_add(*(outer(x, y) for points in group for x, y in zip(*points))), one)
         h = jnp.transpose(h, (2, 3, 0, 1))
-        a, b = (i if i is None else _cut(i, pair, pair + p) for i in (c.a, c.b))
+        a, b = (i if i is None else _cut(i, start, start + len(h)) for i in (c.a, c.b))
         yield b, b, h[:, :, -size:, -size:]
         if a is not None:
             yield a, a, of_a(h[:, :, :size, :size], 2, 3)
             yield a, b, -of_a(h[:, :, :size, -size:], 2)
             yield b, a, -of_a(h[:, :, -size:, :size], 3)
-        at, pair = at + s * p, pair + p
+        start += len(h)
 
 
 def _cut(index, start: int, stop: int):
@@ -692,16 +685,20 @@ def _order(pivots):
     """The order of the rows of (B, N) matrices of which row k was exchanged with row pivots[k], one after the other."""
     worlds, n = pivots.shape
     read = lambda x, *at: jax.lax.dynamic_slice(x, at, (1, 1))
+    rows = jax.lax.broadcasted_iota(pivots.dtype, (1, n), 1)
 
-    def exchange(world, k, order):
-        other = read(pivots, world, k)[0, 0]
-        mine, its = read(order, world, k), read(order, world, other)
-        order = jax.lax.dynamic_update_slice(order, its, (world, k))
-        return jax.lax.dynamic_update_slice(order, mine, (world, other))
+    def of_world(world):
+        def exchange(k, order):  # of one world, as XLA copies what it changes here
+            other = read(pivots, world, k)[0, 0]
+            mine, its = read(order, 0, k), read(order, 0, other)
+            return jax.lax.dynamic_update_slice(jax.lax.dynamic_update_slice(order, its, (0, k)), mine, (0, other))
 
-    rows = jax.lax.broadcasted_iota(pivots.dtype, pivots.shape, 1)
-    of_world = lambda world, order: repeat(0, n, lambda k, order: exchange(world, k, order), order)
-    return repeat(0, worlds, of_world, rows)
+        return repeat(0, n, exchange, rows)
+
+    if worlds == 1:
+        return of_world(0)
+    put = lambda world, orders: jax.lax.dynamic_update_slice(orders, of_world(world), (world, 0))
+    return repeat(0, worlds, put, jnp.zeros_like(pivots))
 
 
 @_dense_general_solve.defjvp
