@@ -83,7 +83,9 @@ def advance_to_impacts(
         world_now = world._with(bodies=bodies, kinematic=kinematic)
         flight = Flight(bodies, a, tau, free)
         found = jax.lax.stop_gradient((p, pairs, world_now, flight, left - last))
-        hits = [_soonest(_search(model, found[0], g, sel, *found[2:])) for g, sel in zip(groups, found[1])]
+        hits = implicit.found(
+            [_soonest(_search(model, found[0], g, sel, *found[2:])) for g, sel in zip(groups, found[1])]
+        )
         soonest = hits[0][0]
         for t, _ in hits[1:]:
             soonest = jnp.minimum(soonest, t)

@@ -17,7 +17,21 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
 from jax.custom_derivatives import SymbolicZero
+
+
+def found(tree):
+    """``tree``, which ``recomputed`` keeps: the result of a search that is not differentiated itself."""
+    return jax.tree.map(lambda c: checkpoint_name(c, _FOUND), tree)
+
+
+def recomputed(f):
+    """``f``, of which reverse mode keeps the arguments and what is ``found``; it computes the rest again."""
+    return jax.checkpoint(f, prevent_cse=False, policy=jax.checkpoint_policies.save_only_these_names(_FOUND))
+
+
+_FOUND = "found"
 
 
 def root(solve, residual, correction, steps: int = 1, better=None):
@@ -53,7 +67,7 @@ def root(solve, residual, correction, steps: int = 1, better=None):
 
     def rule(primals, tangents):
         (theta,), (change,) = primals, tangents
-        p = solution(theta)
+        p = found(solution(theta))
         r = tangent(lambda theta: residual(p, theta), theta, change)
         return p, correction(p, theta, r)
 

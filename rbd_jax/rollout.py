@@ -87,10 +87,11 @@ def rollout(
       steps: number of steps, >= 0.
       every: steps between two samples of the trajectory, >= 1.
       control: as for :func:`step`; a function is called at every step.
-      checkpoint: memory of reverse mode. None: what every step needs to be differentiated is kept. K: the state at
-        the start of every block of K steps is kept, and a block is computed again when it is differentiated; this
-        needs steps / K states and K steps' intermediate values, so take K = sqrt(steps) or less. (K1, K2, ...),
-        decreasing: blocks of K1 steps in blocks of K2 and so on, each level computing its steps once more;
+      checkpoint: memory of reverse mode. None: the state at the start of every step is kept, and what its solver
+        found; the rest of a step is computed again when it is differentiated. K: the state at the start of every block
+        of K steps is kept, and a block is run again when it is differentiated; this needs steps / K states and
+        what None needs for K steps, so take K = sqrt(steps) or less. (K1, K2, ...), decreasing: blocks of K1 steps in
+        blocks of K2 and so on, each level computing its steps once more;
         K1 = steps^(2/3), K2 = steps^(1/3) for very long rollouts. A block ends at a sample: K is rounded down to a
         multiple of ``every``, or the steps between two samples are divided. What is left over is a block of its
         own, and compiles the step once more. Values, forward mode and forward cost are those of None.

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
+from . import implicit
 from .bodies import Bodies
 from .detect import chosen, detect, everything, of_places, put_back
 from .events import advance_to_impacts, carried
@@ -315,6 +316,10 @@ def held(step, p: Params, world: World, wrench, *others):
     forward mode and so, transposed, in reverse mode; shared numbers of ``p`` and ``wrench`` become one for each world
     there. ``others`` may have any shapes; what a lost world does to their derivatives is left to ``step``.
     ``step`` closes over static values only.
+
+    Reverse mode keeps ``world`` and what was ``found``, and computes the rest of the step again. To keep all that it
+    needs takes longer: it is a thousand small arrays, each written and read by a kernel of its own (measured on ten
+    boxes and balls: 12 MB for 0.7 MB in a hundred steps, and a twelfth of the time).
     """
 
     @jax.custom_jvp
@@ -330,8 +335,10 @@ def held(step, p: Params, world: World, wrench, *others):
         each = lambda f, leaves: [f(c) if i < count else c for i, c in zip(at, leaves)]
         real = lambda c: jnp.issubdtype(c.dtype, jnp.inexact)
 
+        whole = implicit.recomputed(lambda *values: step(*put(values)))
+
         def floats(*values):
-            leaves, tree = jax.tree.flatten(step(*put(values)))
+            leaves, tree = jax.tree.flatten(whole(*values))
             return [c for c in leaves if real(c)], ([None if real(c) else c for c in leaves], tree)
 
         floating, linear, (leaves, tree) = jax.linearize(floats, *each(wide, values), has_aux=True)

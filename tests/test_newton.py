@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from mujoco_pairs import GeomLaw, PairLaw, combine, law_of_pairs
 
+import rbd_jax as rbd
 from rbd_jax.bodies import Inertia
-from rbd_jax.solvers import dense
+from rbd_jax.solvers import dense, joined
 from rbd_jax.solvers.base import Problem
 from rbd_jax.solvers.laws import NearRigid
 from rbd_jax.solvers.mujoco import MujocoNewton
@@ -819,3 +820,55 @@ def test_mujoco_bouncing_sphere():
     mujoco.mju_quat2Mat(end, d.qpos[3:])
     np.testing.assert_allclose(ours[-1, 6:], end.reshape(3, 3) @ d.qvel[3:], atol=1e-6)
     assert (theirs[:, 2] < 0.1).sum() > 100
+
+
+# --- groups that are solved as one ---------------------------------------------------------------
+
+
+def mixed():
+    """Boxes and balls on and beside each other: five kinds of pairs, which all touch."""
+    box, ball = rbd.Box((0.1,) * 3), rbd.Sphere(0.1)
+    bodies = [
+        rbd.Body("low", box, pos=(0, 0, 0.0995), vel=(0.3, 0, 0), omega=(0, 0, 0.5)),
+        rbd.Body("high", box, pos=(0.03, 0.01, 0.299)),
+        rbd.Body("left", ball, pos=(-0.199, 0, 0.0995), vel=(0.1, 0.2, 0)),
+        rbd.Body("far", ball, pos=(-0.398, 0, 0.0995)),
+    ]
+    return rbd.Scene(bodies, [rbd.Plane()], dt=1 / 240)
+
+
+@pytest.mark.parametrize("solver", ["newton_cone", NewtonLagged(polish=4)], ids=["cone", "lagged"])
+def test_groups_solved_as_one_are_solved_as_they_are_alone(solver, monkeypatch):
+    model, state = rbd.build(mixed(), method=rbd.Method("symtop2", "near_rigid", solver))
+    assert len(model.structure.groups) == 5
+
+    def step(vel, state):
+        after = rbd.rollout(model, state.replace(vel=vel), 1)[0]
+        return (after.vel**2).sum() + (after.omega**2).sum(), after.memory.contacts
+
+    def of(kind):
+        monkeypatch.setattr(joined, "_kind", kind)
+        jax.clear_caches()
+        (_, contacts), slope = jax.jit(jax.value_and_grad(step, has_aux=True))(state.vel, state)
+        return contacts, slope, count
+
+    of_kind, count = joined._kind, []
+    together = of(lambda *args: count.append(of_kind(*args)) or count[-1])
+    assert 0 < len(set(count)) < 5
+    alone = of(lambda number, *_: number)
+    for a, b in zip(jax.tree.leaves(together[:2]), jax.tree.leaves(alone[:2]), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-9)
+    assert all(np.abs(c.n).max() > 0 for c in together[0])
+
+
+@pytest.mark.parametrize("worlds", [1, 3])
+def test_a_system_that_is_not_symmetric_is_solved(worlds):
+    h = jax.random.normal(jax.random.key(0), (worlds, 18, 18))
+    b = jax.random.normal(jax.random.key(1), (worlds, 18))
+    solved = jax.jit(jax.value_and_grad(lambda h, b: (dense._dense_general_solve(h, b) ** 2).sum(), argnums=(0, 1)))
+    value, slopes = solved(h, b)
+    x = np.linalg.solve(h, b[..., None])
+    np.testing.assert_allclose(value, (x**2).sum(), rtol=1e-9)
+    db = np.linalg.solve(np.swapaxes(h, 1, 2), 2 * x)
+    np.testing.assert_allclose(slopes[1], db[..., 0], rtol=1e-8)
+    np.testing.assert_allclose(slopes[0], -db * np.swapaxes(x, 1, 2), rtol=1e-8)

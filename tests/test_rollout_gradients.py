@@ -116,6 +116,30 @@ def test_memory_of_reverse_mode_hardly_grows_with_the_steps():
     assert memory(1000, None) >= 4 * short
 
 
+def scans(jaxpr):
+    """All loops of a fixed length in a jaxpr."""
+    for eqn in jaxpr.eqns:
+        if eqn.primitive.name == "scan":
+            yield eqn
+        for value in eqn.params.values():
+            for inside in value if isinstance(value, (tuple, list)) else (value,):
+                inside = getattr(inside, "jaxpr", inside)
+                if hasattr(inside, "eqns"):
+                    yield from scans(inside)
+
+
+def test_reverse_mode_keeps_of_a_step_its_state_and_what_was_found():
+    """Not the hundreds of arrays that its derivative is made of."""
+    model, state = rbd.build(scenes.stack(2), method="gradient")
+    end = lambda v: rbd.rollout(model, state.replace(vel=v), 50, every=50)[0].pos
+    jaxpr = jax.make_jaxpr(jax.grad(lambda v: (end(v) ** 2).sum()))(state.vel).jaxpr
+    forward = next(e for e in scans(jaxpr) if e.params["length"] == 50)
+    kept = forward.outvars[forward.params["num_carry"] :]
+    world = sum(v.aval.size for v in forward.outvars[: forward.params["num_carry"]])
+    assert 0 < sum(v.aval.size for v in kept) <= 4 * 50 * world
+    assert len(kept) <= 100
+
+
 # --- truncation ---
 
 

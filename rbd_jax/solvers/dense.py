@@ -684,20 +684,21 @@ def _dense_general_solve(h, b):
 def _order(pivots):
     """The order of the rows of (B, N) matrices of which row k was exchanged with row pivots[k], one after the other."""
     worlds, n = pivots.shape
+    zero = jnp.int32(0)
     read = lambda x, *at: jax.lax.dynamic_slice(x, at, (1, 1))
     rows = jax.lax.broadcasted_iota(pivots.dtype, (1, n), 1)
 
     def of_world(world):
         def exchange(k, order):  # of one world, as XLA copies what it changes here
             other = read(pivots, world, k)[0, 0]
-            mine, its = read(order, 0, k), read(order, 0, other)
-            return jax.lax.dynamic_update_slice(jax.lax.dynamic_update_slice(order, its, (0, k)), mine, (0, other))
+            mine, its = read(order, zero, k), read(order, zero, other)
+            return jax.lax.dynamic_update_slice(jax.lax.dynamic_update_slice(order, its, (zero, k)), mine, (zero, other))
 
         return repeat(0, n, exchange, rows)
 
     if worlds == 1:
-        return of_world(0)
-    put = lambda world, orders: jax.lax.dynamic_update_slice(orders, of_world(world), (world, 0))
+        return of_world(zero)
+    put = lambda world, orders: jax.lax.dynamic_update_slice(orders, of_world(world), (world, zero))
     return repeat(0, worlds, put, jnp.zeros_like(pivots))
 
 

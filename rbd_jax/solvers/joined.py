@@ -1,7 +1,8 @@
 """Layer 5: groups of contact rows as one group of points, for solvers of coupled systems.
 
 What a solver does to a group it writes into the program once for each of them, and in a derivative several times more.
-Here groups of a kind become one: their points (S, P, B), one group after the other, are (1, K, B). Fixed geometry becomes a body after the last one, which does not move (``Contacts.anchored``).
+Here groups of a kind become one: their points (S, P, B), one group after the other, are (1, K, B). Fixed geometry
+becomes a body after the last one, which does not move (``Contacts.anchored``).
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ from .rows import Index
 
 @struct
 class Joint:
-    """Which groups became which: ``members``: the numbers of the groups of every joined one; ``shapes``: (S, P) of
-    every group.
+    """Which groups became which.
+
+    members: the numbers of the groups of every joined one. shapes: (S, P) of every group.
     """
 
     members: tuple = static(default=())

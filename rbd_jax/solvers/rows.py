@@ -188,9 +188,7 @@ def _scatter_added(x: jax.Array, column: np.ndarray, values: jax.Array, unique: 
     x = jnp.broadcast_to(x, (len(x), *shape))
     values = jnp.broadcast_to(values, (len(column), *shape))
     numbers = jax.lax.ScatterDimensionNumbers(tuple(range(1, x.ndim)), (0,), (0,))
-    return jax.lax.scatter_add(
-        x, column, values, numbers, unique_indices=unique, mode="promise_in_bounds"
-    )
+    return jax.lax.scatter_add(x, column, values, numbers, unique_indices=unique, mode="promise_in_bounds")
 
 
 def take_tree(tree, index):
