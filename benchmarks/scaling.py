@@ -9,15 +9,17 @@ time is not in it. Slopes are least-squares fits of log time against log size. R
 
     batch     one ball, one box: 1 to 2^20 worlds
     bodies    blocks of touching spheres, one world, 1 to 1,000 bodies
-    contacts  64 spheres in one world, of which ever more touch
+    contacts  64 spheres, of which ever more lie side by side on the ground, 256 worlds
     latency   one world: ``step`` and ``rollout``, beside MuJoCo's one thread
 
-Appends to scaling.jsonl and writes scaling.md and scaling.png under ``--out`` (benchmarks/results).
+Appends to scaling.jsonl and writes scaling.md and scaling.png under ``--out`` (benchmarks/results), from the last run
+of every curve and of every scene of ``latency``.
 """
 
 from __future__ import annotations
 
 import functools
+import json
 import pathlib
 import sys
 import time
@@ -93,23 +95,24 @@ def bodies_rows(args):
                "contacts": live, "status": int(np.asarray(final.status).max())}  # fmt: skip
 
 
+def sheet(rows: int) -> rbd.Scene:
+    """64 spheres, of which ``rows`` rows of eight lie side by side on the ground; the others fall far above it."""
+    lies = lambda k: k // 8 < rows
+    place = lambda k: (0.1999 * (k % 8), 0.1999 * (k // 8), 0.0999) if lies(k) else (k % 8, k // 8, 50.0)
+    bodies = [rbd.Body(f"b{k}", rbd.Sphere(0.1), friction=0.5, pos=place(k)) for k in range(64)]
+    return rbd.Scene(bodies, [rbd.Geom(rbd.Plane(), friction=0.5)], dt=throughput.DT)
+
+
 def contacts_rows(args):
-    """64 spheres on a frictional plane, columns of touching ones: the taller, the more contacts."""
-    for high in (1, 4) if args.smoke else (1, 2, 4, 8, 16):
-        bodies = [
-            rbd.Body(f"b{k}", rbd.Sphere(0.1), friction=0.5,
-                     pos=(1.0 * (k // high % 8), 1.0 * (k // high // 8), 0.1 + 0.1999 * (k % high)))
-            for k in range(64)
-        ]  # fmt: skip
-        model, one = rbd.build(
-            rbd.Scene(bodies, [rbd.Geom(rbd.Plane(), friction=0.5)], dt=throughput.DT), method="fast"
-        )
+    """The contacts are those at the end of the run, in which nothing comes together or apart."""
+    for rows in (0, 1) if args.smoke else (0, 1, 2, 4, 8):
+        model, one = rbd.build(sheet(rows), method="fast")
         state, steps = rbd.batch(one, 1 if args.smoke else 256), 10 if args.smoke else 50
         took = seconds_a_step(model, state, steps, args.repeats)
         final = rbd.rollout(model, state, steps, every=steps)[0]
-        live = int(np.asarray(rbd.contacts(model, jax.tree.map(lambda c: c[:1], final)).live).sum())
-        yield {"row": "contacts", "scene": "64 spheres in columns", "size": live, "steps": steps,
-               "worlds": state.batch_shape[0], "step_s": took / state.batch_shape[0]}  # fmt: skip
+        found = rbd.contacts(model, jax.tree.map(lambda c: c[:1], final))
+        yield {"row": "contacts", "scene": "64 spheres, some side by side", "size": int(np.asarray(found.live).sum()),
+               "steps": steps, "worlds": state.batch_shape[0], "step_s": took / state.batch_shape[0]}  # fmt: skip
 
 
 def latency_rows(args):
@@ -190,13 +193,26 @@ def chart(rows, path):
     plt.close(figure)
 
 
-def report(env, rows, took) -> str:
-    text = [
-        f'# Scaling\n\n{common.header(env)}\nMade by `benchmarks/scaling.py` in {took:.0f} s; preset "fast", float32.\n'
-    ]
+def latest(rows) -> list[dict]:
+    """The rows of the last run of every curve, and the last of every scene and method of ``latency``."""
+    which = lambda r: (r["row"], r["scene"], r.get("method"))
+    last = {which(r): r["date"] for r in rows}
+    known = {kind: dict.fromkeys(r["scene"] for r in rows if r["row"] == kind and r["date"] == newest(rows, kind))
+             for kind in ROWS}  # fmt: skip
+    return [r for r in rows if r["date"] == last[which(r)] and (r["row"] == "latency" or r["scene"] in known[r["row"]])]
+
+
+def newest(rows, kind: str) -> str:
+    """When a kind of row was measured last."""
+    return max((r["date"] for r in rows if r["row"] == kind), default="")
+
+
+def report(rows) -> str:
+    text = ['# Scaling\n\nMade by `benchmarks/scaling.py`; preset "fast", float32.\n']
     for (kind, scene), (sizes, times) in curves(rows).items():
+        env = next(r for r in rows if (r["row"], r["scene"]) == (kind, scene))
         fit = slope(sizes, times, FIT_FROM[kind])
-        text.append(f"## {kind}: {scene}\n\nslope {number(fit)} (from {FIT_FROM[kind]:,} on)\n")
+        text.append(f"## {kind}: {scene}\n\n{common.header(env)}\n\nslope {number(fit)} (from {FIT_FROM[kind]:,} on)\n")
         per = {"batch": "ns a world", "bodies": "µs a body", "contacts": "µs a contact"}[kind]
         scale = {"batch": 1e9, "bodies": 1e6, "contacts": 1e6}[kind]
         text.append(
@@ -214,6 +230,7 @@ def report(env, rows, took) -> str:
     if late:
         text.append("## One world [µs a step]\n\n`rollout`: inside one call. `step`: called from Python, each waited "
                     "for by the next. MuJoCo: one thread, `rollout` and `mj_step`.\n")  # fmt: skip
+        text.append("\n\n".join(dict.fromkeys(common.header(r) for r in late)) + "\n")
         cells = []
         for r in late:
             bar = LATENCY_BARS.get(r["scene"]) if r["method"] == "fast" else None
@@ -241,17 +258,17 @@ def main(args) -> int:
     if args.smoke:
         args.repeats = 1
     print(common.header(env), flush=True)
-    rows = []
     for kind in chosen or ROWS:
         for row in KINDS[kind](args):
-            rows.append(row)
             common.append_lines(out / "scaling.jsonl", [{**env, "benchmark": "scaling", **row}])
             size = f"{row['size']:9,d}" if "size" in row else row["method"]
             ratio = f"  {row['ratio']:.3g} x MuJoCo" if "ratio" in row else ""
             print(f"{kind:9s} {row['scene']:22s} {size:>9s} {1e6 * row['step_s']:12.3f} us a step{ratio}"
                   f"   ({time.perf_counter() - begin:.0f} s)", flush=True)  # fmt: skip
+    lines = (out / "scaling.jsonl").read_text(encoding="utf-8").splitlines()
+    rows = latest([json.loads(line) for line in lines])
     chart(rows, out / "scaling.png")
-    (out / "scaling.md").write_text(report(env, rows, time.perf_counter() - begin), encoding="utf-8")
+    (out / "scaling.md").write_text(report(rows), encoding="utf-8")
     print(f"wrote {out / 'scaling.jsonl'}, {out / 'scaling.md'}")
     return 0
 

@@ -20,6 +20,8 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jax.custom_derivatives import SymbolicZero
 
+_FOUND = "found"
+
 
 def found(tree):
     """``tree``, which ``recomputed`` keeps: the result of a search that is not differentiated itself."""
@@ -29,9 +31,6 @@ def found(tree):
 def recomputed(f):
     """``f``, of which reverse mode keeps the arguments and what is ``found``; it computes the rest again."""
     return jax.checkpoint(f, prevent_cse=False, policy=jax.checkpoint_policies.save_only_these_names(_FOUND))
-
-
-_FOUND = "found"
 
 
 def root(solve, residual, correction, steps: int = 1, better=None):

@@ -28,7 +28,8 @@ def opaque_one(x: jax.Array) -> jax.Array:
 
 
 def materialise(tree, one: jax.Array | float | None = 1.0):
-    """The same values, computed once however many kernels use them (an infinite value becomes NaN).
+    """The same values, computed once however many kernels use them. An infinite value becomes NaN, and what is in its
+    place in other leaves of its shape may: they share divisors, made of the first of them.
 
     ``one``: a number, or an array (B,) with one for each world; None leaves the fusion to XLA. A thread of a GPU
     computes everything once.

@@ -2,7 +2,8 @@
 
 A convex contact problem minimises (v - v*)' M (v - v*) / 2 + sum_c l_c(J_c v). Its Newton step needs
 (M + J' G J) d = r, G = the Hessian of l in the contact frame of every point. When no group couples two
-bodies this is one system a body, solved component by component; else one dense matrix a world.
+bodies this is one system a body, solved component by component; else one dense matrix a world, from whole rows
+of J in world axes (``jacobian``).
 
 All rows live in the contact frame of their pair, x along t1, y along t2, z along n, which the slots
 of a pair share: the sums over slots are done there and only their results are turned to world axes.
@@ -692,7 +693,8 @@ def _order(pivots):
         def exchange(k, order):  # of one world, as XLA copies what it changes here
             other = read(pivots, world, k)[0, 0]
             mine, its = read(order, zero, k), read(order, zero, other)
-            return jax.lax.dynamic_update_slice(jax.lax.dynamic_update_slice(order, its, (zero, k)), mine, (zero, other))
+            order = jax.lax.dynamic_update_slice(order, its, (zero, k))
+            return jax.lax.dynamic_update_slice(order, mine, (zero, other))
 
         return repeat(0, n, exchange, rows)
 
