@@ -133,6 +133,9 @@ def rollout(
     _check_wrench(model, state, control)
     steps, every = int(steps), int(every)
     traced = any_traced((model, state, control))
+    if not traced:
+        # a memory of constants would be another program
+        state = with_memory(model, state)
     core, args = _forward(model, state, control, steps, every, traced)
     use = means(core, args, batch, steps)
     refuse(state, math.prod(batch), steps // every + 1, 1 + (use.cores > 1), use.devices)
@@ -586,6 +589,6 @@ def program(model: Model, state: State, steps: int, every: int):
     batch = state.batch_shape
     core, args = _forward(model, state, None, steps, every)
     parts = means(core, args, batch, steps).cores
-    out = jax.eval_shape(core, *args)
     lowered = lowered_share(core, *args, batch, parts) if parts > 1 else _here.lower(core, *args)
-    return lowered.compile(), parts, out
+    # not the shape of ``core`` by itself: JAX would keep that trace, of kernels, and put it into the one function
+    return lowered.compile(), parts, _here.eval_shape(core, *args)

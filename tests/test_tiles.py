@@ -473,3 +473,14 @@ def test_export_and_load(tmp_path):
     path.write_bytes(jax.export.export(jax.jit(pos))(*leaves).serialize())
     loaded = jax.export.deserialize(bytearray(path.read_bytes()))
     assert np.array_equal(loaded.call(*leaves), pos(*leaves))
+
+
+def test_the_estimate_compiles_the_program_that_runs():
+    """Its shapes were once asked for first: that trace, of kernels, went into the one function, and 16 worlds of a box
+    then took all memory there was to compile."""
+    jax.clear_caches()
+    model, state = rbd.build(rbd.Scene([rbd.Body("box", rbd.Box((0.1, 0.15, 0.2)), pos=(0, 0, 0.3))], [rbd.Plane()]))
+    estimate = rbd.memory_estimate(model, 16, 10, 10)
+    assert 0 < estimate.work < 1e6
+    final, _ = rbd.rollout(model, rbd.batch(state, 16), 10, every=10)
+    assert np.isfinite(final.pos).all()
