@@ -12,7 +12,6 @@ from .model import Model
 from .rollout import program
 from .spatial import Quat, Vec3
 from .state import Kinematic, State
-from .step import with_memory
 
 
 def memory_estimate(model: Model, batch: int | tuple[int, ...], steps: int, every: int = 1) -> MemoryEstimate:
@@ -29,7 +28,7 @@ def memory_estimate(model: Model, batch: int | tuple[int, ...], steps: int, ever
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"memory_estimate: {name} = {value!r} must be an integer >= 1")
     worlds = math.prod(batch)
-    state = jax.eval_shape(lambda: with_memory(model, blank(model, batch)))
+    state = jax.eval_shape(lambda: blank(model, batch))
     abstract = jax.tree.map(lambda c: jax.ShapeDtypeStruct(c.shape, c.dtype), model)
     compiled, parts, out = program(abstract, state, steps, every)
     plan = compiled.memory_analysis()

@@ -133,9 +133,6 @@ def rollout(
     _check_wrench(model, state, control)
     steps, every = int(steps), int(every)
     traced = any_traced((model, state, control))
-    if not traced:
-        # a memory of constants would be another program
-        state = with_memory(model, state)
     core, args = _forward(model, state, control, steps, every, traced)
     use = means(core, args, batch, steps)
     refuse(state, math.prod(batch), steps // every + 1, 1 + (use.cores > 1), use.devices)

@@ -10,6 +10,7 @@ import pytest
 import scenes
 
 import rbd_jax as rbd
+from rbd_jax.xla import called
 
 G, H = 9.81, 1 / 240
 
@@ -121,11 +122,8 @@ def scans(jaxpr):
     for eqn in jaxpr.eqns:
         if eqn.primitive.name == "scan":
             yield eqn
-        for value in eqn.params.values():
-            for inside in value if isinstance(value, (tuple, list)) else (value,):
-                inside = getattr(inside, "jaxpr", inside)
-                if hasattr(inside, "eqns"):
-                    yield from scans(inside)
+        for inside in called(eqn.params):
+            yield from scans(inside)
 
 
 def test_reverse_mode_keeps_of_a_step_its_state_and_what_was_found():

@@ -382,10 +382,8 @@ def _coupled(cs, gs, rhs, problem: Problem):
     h = add_rows(h, Index(np.arange(n) * (rows + 1)), own, unique=True)
     for c, g in zip(cs, gs):
         for p, q, block in _pair_blocks(c, g, problem.one, size):
-            if isinstance(p, Index):
-                h = add_rows(h, Index(p.rows * rows + q.rows), block)
-            else:
-                h = h.at[p * rows + q, jnp.arange(worlds)[None, :]].add(block)
+            fixed = isinstance(p, Index)
+            h = add_rows(h, Index(p.rows * rows + q.rows) if fixed else p * rows + q, block)
     h = h.reshape(rows, rows, worlds, size, size)[:n, :n]
     h = jnp.transpose(h, (2, 0, 3, 1, 4)).reshape(worlds, n * size, n * size)
     b = vector(components(rhs[0]) + (components(rhs[1]) if spin else ()))  # (n, size, B)
