@@ -31,8 +31,8 @@ def materialise(tree, one: jax.Array | float | None = 1.0):
     """The same values, computed once however many kernels use them. An infinite value becomes NaN, and what is in its
     place in other leaves of its shape may: they share divisors, made of the first of them.
 
-    ``one``: a number, or an array (B,) with one for each world; None leaves the fusion to XLA. A thread of a GPU
-    computes everything once.
+    ``one``: a number, or an array (B,) with one for each world, or one of the leaves' own shape; None leaves the fusion
+    to XLA. A thread of a GPU computes everything once.
     """
     if one is None or in_a_thread():
         return tree
@@ -54,6 +54,8 @@ def unit(x: jax.Array, one) -> jax.Array:
     again. Where x has one number a world they are ``one`` itself, two operations less.
     """
     if jnp.ndim(one):
+        if x.shape == one.shape:
+            return one
         if x.shape[-1:] != one.shape:  # the same for all worlds
             one = one[0]
         elif x.size == one.size:

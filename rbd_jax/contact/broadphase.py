@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..loops import only_if, repeat, write
+from ..loops import only_if, read, repeat, write
 from ..spatial import Vec3
 from ..struct import struct
 from ..xla import largest, summed
@@ -162,6 +162,8 @@ def lookup_of_one(pairs: jax.Array, previous: jax.Array, filled: jax.Array) -> j
 
 #: Words of which it is asked at once whether they have a bit.
 TOGETHER = 16
+#: Words that one world looks at together.
+COLUMNS = 128
 
 
 def _words(a: Bounds, b: Bounds, balls: bool, allowed: np.ndarray | None) -> jax.Array:
@@ -204,31 +206,61 @@ def all_pairs(a: Bounds, b: Bounds, balls: bool, allowed: np.ndarray | None, cap
 
 
 def pairs_of_one(a: Bounds, b: Bounds, balls: bool, allowed: np.ndarray | None, capacity: int):
-    """As ``all_pairs``, of one world and for a program that is one function of the CPU (``xla.one_function``)."""
-    word = _words(a, b, balls, allowed)[..., 0].ravel()
-    none = no_key(len(a), len(b))
-    word = jnp.pad(word, (0, -len(word) % TOGETHER))
-    some = largest(word.reshape(-1, TOGETHER), 1) != 0
+    """As ``all_pairs``, of one world and for a program that is one function of the CPU (``xla.one_function``).
 
-    def of_word(k, carry):
-        left = word[k]
+    COLUMNS words at a time, which stay in the first cache; of one list of geoms, against itself, from the diagonal on.
+    """
+    same, count_a, count_b = a is b, len(a), len(b)
+    none, words = no_key(count_a, count_b), -(-count_a // WORD)
+    columns = min(COLUMNS, -(-count_b // TOGETHER) * TOGETHER)
+    blocks = -(-count_b // columns)
+    a, b = _far(a, words * WORD), _far(b, blocks * columns)
+    if allowed is not None:
+        allowed = jnp.asarray(np.pad(allowed, ((0, 0), (0, blocks * columns - count_b))))
 
-        def step(carry):
-            left, count, keys = carry
-            bit = jax.lax.population_count((left & (~left + 1)) - 1).astype(jnp.int32)
-            # what is one too many is written behind the others
-            keys = write(keys, jnp.minimum(count, capacity), (k * WORD + bit)[None])
-            return left & (left - 1), count + 1, keys
+    def of_block(w, k, carry):
+        rows = jax.tree.map(lambda c: jax.lax.dynamic_slice_in_dim(c, w * WORD, WORD), a)
+        others = jax.tree.map(lambda c: jax.lax.dynamic_slice_in_dim(c, k * columns, columns), b)
 
-        return jax.lax.while_loop(lambda c: c[0] != 0, step, (left, *carry))[1:]
+        def bit(i, word):
+            near = close(read(rows, i), others, balls)[:, 0]
+            return word | jnp.where(near, jnp.uint32(1) << i.astype(jnp.uint32), jnp.uint32(0))
 
-    def of_words(k, carry):
-        each = lambda carry: repeat(k * TOGETHER, (k + 1) * TOGETHER, of_word, carry)
-        return only_if(some[k].astype(jnp.int32), each, carry)
+        word = repeat(0, WORD, bit, jnp.zeros(columns, jnp.uint32))
+        if allowed is not None:
+            word = word & jax.lax.dynamic_slice(allowed, (w, k * columns), (1, columns))[0]
+        some = largest(word.reshape(-1, TOGETHER), 1) != 0
+        first = w * count_b + k * columns
+
+        def of_word(j, carry):
+            def step(carry):
+                left, count, keys = carry
+                at = jax.lax.population_count((left & (~left + 1)) - 1).astype(jnp.int32)
+                # what is one too many is written behind the others
+                keys = write(keys, jnp.minimum(count, capacity), ((first + j) * WORD + at)[None])
+                return left & (left - 1), count + 1, keys
+
+            return jax.lax.while_loop(lambda c: c[0] != 0, step, (word[j], *carry))[1:]
+
+        def of_words(g, carry):
+            each = lambda carry: repeat(g * TOGETHER, (g + 1) * TOGETHER, of_word, carry)
+            return only_if(some[g].astype(jnp.int32), each, carry)
+
+        return repeat(0, len(some), of_words, carry)
+
+    def of_row(w, carry):
+        return repeat(w * WORD // columns if same else 0, blocks, lambda k, carry: of_block(w, k, carry), carry)
 
     start = (jnp.int32(0), jnp.full(capacity + 1, none, jnp.int32))
-    count, keys = repeat(0, len(some), of_words, start)
+    count, keys = repeat(0, words, of_row, start)
     return keys[:capacity, None], count[None] > capacity
+
+
+def _far(x: Bounds, size: int) -> Bounds:
+    """``x`` with geoms infinitely far away until there are ``size``."""
+    pad = lambda c, value: jnp.pad(c, ((0, size - c.shape[0]), (0, 0)), constant_values=value)
+    whole = lambda c: jnp.broadcast_to(c, (len(x), 1))
+    return Bounds(x.x.map(lambda c: pad(whole(c), jnp.inf)), x.half.map(lambda c: pad(whole(c), 0)))
 
 
 def grid_pairs(a: Bounds, b: Bounds | None, balls: bool, allowed: np.ndarray | None, capacity: int, candidates: int):

@@ -2,7 +2,8 @@
 
 The rows of a colour share no body and are solved at once; colours, and the slots of a pair, in order. The three
 rows of a point are one block: the normal impulse, then the friction disc |p_t| <= mu p_n around it.
-Pairs that differ from world to world are coloured in the step and put into chunks (``colouring``).
+Pairs that differ from world to world are coloured in the step and put into chunks (``colouring``); so are many
+pairs of one world, where that takes no time (``lanes``).
 
 Symbols: n, t1, t2 contact frame; r arm; k inverse mass seen by a row; l accumulated impulse.
 Cost: about 100 flops a point and sweep.
@@ -14,20 +15,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..loops import Listed, in_blocks, listed, only_if, repeat
+from ..loops import Listed, in_blocks, listed, only_if, read, repeat, write
 from ..spatial import Vec3
 from ..struct import struct
 from ..xla import in_a_thread, in_one_function, loops_are_cheap, materialise, piece, summed
 from .base import Problem, Solution
 from .colouring import Plan, plan
+from .lanes import Lanes, lanes
 from .laws import Law
 from .restitution import Events, normal_velocity, targets
-from .rows import Impulses, Index, Rows, add_trees, by_pair, take, take_tree
+from .rows import Impulses, Index, Rows, add_trees, by_pair, gathered, take, take_tree
 
 #: Groups with more rows than this (slots x colours) loop over their slots instead of unrolling them.
 UNROLL = 4
 #: Worlds from which on a program need not be short: what it computes takes longer than what it starts.
 FEW = 32
+#: Pairs from which on those of one world are solved in lanes: to find places for fewer takes as long as it saves.
+MANY = 256
 #: Groups with more colours than this loop over them too: 16 balls compile in a fifth of the time.
 UNROLL_COLOURS = 8
 
@@ -36,8 +40,9 @@ UNROLL_COLOURS = 8
 class Group:
     """A group of rows with what every sweep needs: effective masses and, with restitution, events.
 
-    plan: for pairs that differ from world to world: where they went; the rows are in the order of its places. points:
-    those that are live in any world, pair * slots + slot, in the order of a sweep: pair by pair, slot by slot.
+    plan: for pairs that differ from world to world: where they went; the rows are in the order of its places. lanes:
+    the same of many pairs of one world. points: those that are live in any world, pair * slots + slot, in the order of
+    a sweep: pair by pair, slot by slot.
     """
 
     rows: Rows
@@ -55,6 +60,7 @@ class Group:
     plan: Plan | None = None
     couples: Couples | None = None
     points: Listed | None = None
+    lanes: Lanes | None = None
 
 
 @struct
@@ -108,13 +114,32 @@ def relaxing(g: Group, lam: Impulses, body, h) -> Sweep:
     return Sweep(bias, jnp.where(idle, 0.0, g.mass_n), 0.0)
 
 
-def arranged(tree, plan: Plan | None):
-    """Arrays over pairs, (C, B) or (S, C, B), in the order of the plan's places; arrays of one pair stay."""
-    if plan is None:
-        return tree
-    pairs = plan.place.shape[0]
-    source = jnp.minimum(plan.source, pairs - 1)
-    return jax.tree.map(lambda c: _places(c, source) if jnp.ndim(c) and c.shape[-2] == pairs else c, tree)
+def arranged(tree, source: jax.Array, pairs: int):
+    """Arrays over pairs, (C, B) or (S, C, B), at the places of which ``source`` (P, B) says what pair they hold, where
+    that is less than ``pairs``; any values in the others. Arrays of one pair stay."""
+    source = jnp.minimum(source, pairs - 1)
+    return jax.tree.map(lambda c: _places(c, source) if jnp.ndim(c) > 1 and c.shape[-2] == pairs else c, tree)
+
+
+def _seated(rows: Rows, source: jax.Array) -> Rows:
+    """The rows at the places of ``source``; an empty place holds no point."""
+    pairs = rows.phi.shape[1]
+    rows = arranged(rows, source, pairs)
+    return rows._with(live=rows.live & (source < pairs))
+
+
+def _placed(lam: Impulses, g: Group) -> Impulses:
+    """Impulses of the pairs at the places of a group, zero where there is none."""
+    where = g.plan or g.lanes
+    if where is None:
+        return lam
+    pairs = len(where.place)
+    lam = jax.tree.map(lambda c: jnp.broadcast_to(c, (g.rows.slots, pairs, g.rows.phi.shape[-1])), lam)
+
+    def at(source):
+        return jax.tree.map(lambda c: jnp.where(source < pairs, c, 0.0), arranged(lam, source, pairs))
+
+    return in_blocks(at, None if g.lanes is None else g.lanes.filled, where.source)
 
 
 def _places(c: jax.Array, index: jax.Array) -> jax.Array:
@@ -125,36 +150,38 @@ def _places(c: jax.Array, index: jax.Array) -> jax.Array:
     return jnp.take_along_axis(c, index.reshape((1,) * (c.ndim - 2) + index.shape), axis=-2, mode="clip")
 
 
-def _restored(lam: Impulses, g: Group) -> Impulses:
-    """Impulses in the order of the pairs again; zero for a pair that has no place."""
-    if g.plan is None:
+def _restored(lam: Impulses, g: Group, filled: jax.Array | None) -> Impulses:
+    """Impulses in the order of the pairs again, of which ``filled`` are filled; zero for a pair that has no place."""
+    where = g.plan or g.lanes
+    if where is None:
         return lam
-    place = g.plan.place
-    back = lambda c: jnp.where(place < c.shape[-2], _places(c, jnp.minimum(place, c.shape[-2] - 1)), 0.0)
-    return jax.tree.map(back, lam)
-
-
-def _planned(rows: Rows, problem: Problem) -> tuple[Rows, Plan]:
-    """The rows of a group whose pairs differ from world to world, in chunks."""
-    p = plan(rows.b, rows.a, rows.live.any(axis=0), problem.v.x.shape[0])
-    rows = arranged(rows, p)
-    return rows._with(live=rows.live & (p.source < p.place.shape[0])), p
+    places = len(where.source)
+    at = lambda place: jax.tree.map(lambda c: jnp.where(place < places, c, 0.0), arranged(lam, place, places))
+    if g.lanes is not None and filled is None:
+        filled = len(where.place)
+    return in_blocks(at, filled, where.place)
 
 
 def prepare(rows: Rows, problem: Problem) -> Group:
-    chunks = None
     fixed = isinstance(rows.b, Index)
-    by_point = in_one_function() and (fixed or rows.b.shape[1] == 1)
-    if not fixed and not by_point:
-        rows, chunks = _planned(rows, problem)
-    if not by_point or rows.filled is None:
-        return _prepared(rows, problem, chunks)._with(points=_listed_points(rows) if by_point else None)
-    g = by_pair(lambda rows: _prepared(rows, problem, None), rows)
+    n, pairs = problem.v.x.shape[0], rows.phi.shape[1]
+    if not (in_one_function() and (fixed or rows.b.shape[1] == 1)):
+        if fixed:
+            return _prepared(rows, problem)
+        p = plan(rows.b, rows.a, rows.live.any(axis=0), n)
+        return _prepared(_seated(rows, p.source), problem)._with(plan=p)
+    if pairs >= MANY and rows.slots == 1 and rows.phi.shape[-1] == 1 and not in_a_thread():
+        b, a = (_bodies(i) for i in (rows.b, rows.a))
+        places = lanes(b, a, rows.live[0, :, 0], n, rows.filled)
+        rows = rows._with(b=b[:, None], a=None if a is None else a[:, None], filled=None, colours=())
+        g = in_blocks(lambda source: _prepared(_seated(rows, source), problem), places.filled, places.source)
+        return g._with(rows=g.rows._with(filled=places.filled), lanes=places)
+    g = by_pair(lambda rows: _prepared(rows, problem), rows)
     return g._with(rows=g.rows._with(filled=rows.filled), points=_listed_points(rows))
 
 
-def _prepared(rows: Rows, problem: Problem, chunks: Plan | None) -> Group:
-    """``prepare`` of pairs in the order in which they are solved, each by itself; without the list of points."""
+def _prepared(rows: Rows, problem: Problem) -> Group:
+    """``prepare`` of pairs in the order in which they are solved, each by itself; without what tells that order."""
     one = problem.one
     rows = rows._with(
         rb=materialise(rows.rb, one),
@@ -204,7 +231,6 @@ def _prepared(rows: Rows, problem: Problem, chunks: Plan | None) -> Group:
         mass_1=mass(k(t1, False, False)) if t1 is not None else None,
         mass_2=mass(k(t2, False, False)) if t2 is not None else None,
         events=materialise_events(targets(rows, problem), one) if rows.e is not None else None,
-        plan=chunks,
         couples=None if rows.mu_spin is None else _couples(rows, t1, t2, ib, ia),
     )
 
@@ -216,7 +242,7 @@ def each(f, groups, *more) -> tuple:
         if g.rows.filled is None:
             out.append(f(g, *args))
             continue
-        bare = g._with(rows=g.rows._with(filled=None), points=None)
+        bare = g._with(rows=g.rows._with(filled=None), points=None, lanes=None)
         out.append(in_blocks(f, g.rows.filled, bare, *args))
     return tuple(out)
 
@@ -284,7 +310,7 @@ def _couple(g: Group, lam: Impulses) -> Vec3:
 def started(problem: Problem):
     """Groups, the impulses to start from, and the velocities that these give."""
     groups = tuple(piece(prepare)(rows, problem.without_rows()) for rows in problem.rows)
-    lam = tuple(arranged(l, g.plan) for g, l in zip(groups, problem.warm))
+    lam = tuple(_placed(l, g) for g, l in zip(groups, problem.warm))
     body = (problem.v, problem.w)
     for g, l in zip(groups, lam):
         body = piece(apply)(g, l, body)
@@ -331,7 +357,7 @@ def sweeps(groups, laws, lam, body, one, count: int):
     once = lambda carry, _: (_once(groups, laws, one, *carry), None)
 
     carry = (body, tuple(lam))
-    rolled = any(g.plan is not None or g.points is not None for g in groups)
+    rolled = any(g.plan or g.points or g.lanes for g in groups)
     if count > UNROLL or (count > 1 and rolled):
         full = lambda l, g: jax.tree.map(lambda c: jnp.broadcast_to(c, g.rows.phi.shape), l)
         carry = (body, tuple(full(l, g) for l, g in zip(lam, groups)))
@@ -352,6 +378,8 @@ def sweep(g: Group, law: Sweep, lam: Impulses, body, one):
     pairs = rows.phi.shape[1]
     if g.points is not None:
         return _sweep_points(g, law, lam, body, one)
+    if g.lanes is not None:
+        return _sweep_lanes(g, law, lam, body, one)
     if not isinstance(rows.b, Index):
         return _sweep_chunks(g, law, lam, body, one)
     colours = rows.colours or ((0, pairs),)
@@ -455,6 +483,47 @@ def _sweep_points(g: Group, law: Sweep, lam: Impulses, body, one):
     body = jax.tree.map(lambda c: jnp.broadcast_to(c, (c.shape[0], worlds)), body)
     _, body, lam = jax.lax.while_loop(lambda c: c[0] < g.points.count, point, (jnp.int32(0), body, lam))
     return body, lam
+
+
+def _sweep_lanes(g: Group, law: Sweep, lam: Impulses, body, one):
+    """As ``sweep``, of one world and points of one slot, chunk after chunk of ``lanes``."""
+    rows, t = g.rows, g.lanes
+    lane = np.arange(t.width, dtype=np.int32)[:, None]
+    ones = one + 0.0 * jax.lax.slice_in_dim(rows.phi[0], 0, t.width)
+    ends = [i for i in (rows.b, rows.a) if i is not None]
+
+    def cut(tree, first):
+        """Arrays (P, 1) or (1, P, 1) at the places of a chunk, (width, 1); what is the same for all pairs stays."""
+
+        def at(c):
+            if jnp.ndim(c) < 2:
+                return c
+            c = c[0] if jnp.ndim(c) == 3 else c
+            return c if c.shape[0] == 1 else jax.lax.dynamic_slice_in_dim(c, first, t.width)
+
+        return jax.tree.map(at, tree)
+
+    def chunk(k, carry):
+        body, lam = carry
+        first, held = t.first[k], t.held[k]
+        here = cut(ends, first)
+        # read once: what is read later, in the kernels that use it, would have to be copied before it is written
+        local = materialise([jax.tree.map(lambda c: gathered(c, end), body) for end in here], ones)
+        old = materialise(cut(lam, first), ones)
+        own = cut(_of_points(g, law), first)
+        new, l = _point(_pair(rows, *cut(_of_pairs(g), first)), (*own, old), (*local, None)[:2], ones)
+
+        def put(i, body):
+            for end, values in zip(here, new):
+                body = write(body, read(end, i)[0, 0], read(values, i))
+            return body
+
+        keep = lambda c, l, old: jax.lax.dynamic_update_slice_in_dim(c, jnp.where(lane < held, l, old)[None], first, 1)
+        return repeat(0, held, put, body), jax.tree.map(keep, lam, l, old)
+
+    lam = jax.tree.map(lambda c: jnp.broadcast_to(c, rows.phi.shape), lam)
+    body = jax.tree.map(lambda c: jnp.broadcast_to(c, (c.shape[0], 1)), body)
+    return repeat(0, t.chunks, chunk, (body, lam))
 
 
 def _bodies(index) -> jax.Array | None:
@@ -677,7 +746,7 @@ def solution(problem: Problem, groups, body, lam, moving=(None, None)) -> Soluti
     return Solution(
         impulse=(v - problem.v) / problem.inv_mass,
         angular_impulse=None if w is None else problem.inertia.momentum(problem.q, w - problem.w),
-        contacts=tuple(_restored(l, g) for l, g in zip(lam, groups)),
+        contacts=tuple(_restored(l, g, rows.filled) for l, g, rows in zip(lam, groups, problem.rows)),
         v_move=moving[0],
         w_move=moving[1],
         overflow=overflow,

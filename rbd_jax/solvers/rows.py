@@ -166,7 +166,7 @@ def take(x: jax.Array, index) -> jax.Array:
             return x
         if len(rows) and np.array_equal(rows, np.arange(rows[0], rows[0] + len(rows))):
             return x[int(rows[0]) : int(rows[0]) + len(rows)]
-        return _gathered(x, index.column)
+        return gathered(x, index.column)
     if x.shape[1] == 1:
         return x[:, 0][index]
     return jnp.take_along_axis(x, index, axis=0)
@@ -176,7 +176,7 @@ def take(x: jax.Array, index) -> jax.Array:
 # instead of one, for each component of each group, and again in every derivative.
 
 
-def _gathered(x: jax.Array, column: np.ndarray) -> jax.Array:
+def gathered(x: jax.Array, column: np.ndarray | jax.Array) -> jax.Array:
     """x[rows], rows as a ``column`` (P, 1)."""
     numbers = jax.lax.GatherDimensionNumbers(tuple(range(1, x.ndim)), (0,), (0,))
     return jax.lax.gather(x, column, numbers, (1, *x.shape[1:]), mode="promise_in_bounds")
