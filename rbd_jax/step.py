@@ -24,6 +24,7 @@ from .detect import chosen, detect, everything, of_places, put_back
 from .events import advance_to_impacts, carried
 from .loops import repeat
 from .model import Model, Params, params
+from .solvers import single
 from .solvers.base import Problem, Solution
 from .solvers.restitution import normal_velocity, targets
 from .solvers.rows import Impulses, Rows, add_rows, add_trees, by_pair, inverse_inertia, spread, take, take_tree
@@ -624,6 +625,11 @@ def _correction(p: Params, problem: Problem, solution: Solution, v0: Vec3, v1: V
     sliding distance second order without lifting or sinking.
     """
     push = zeros_like(v0)
+    if single.applies(problem):
+        (rows,), (lam,) = problem.rows, solution.contacts
+        n = spread(push, rows, rows.n * jnp.where(lam.n[0] > 0, 1.0, 0.0).astype(v0.x.dtype))
+        d = (v0 - v1) * (0.5 * p.h)
+        return d - n * n.dot(d)
     for rows, lam in zip(problem.rows, solution.contacts):
         push = spread(push, rows, rows.n * summed(lam.n))
     if solution.warm:
