@@ -16,8 +16,10 @@ from __future__ import annotations
 
 import argparse
 import functools
+import json
 import os
 import pathlib
+import subprocess
 import sys
 import time
 
@@ -25,7 +27,8 @@ _parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
 _parser.add_argument("--smoke", action="store_true", help="a few seconds: one scene, few worlds and steps")
 _parser.add_argument("--devices", type=int, default=1, metavar="N", help="host devices to shard the batch over")
 _parser.add_argument("--scenes", default="", metavar="A,B", help="only these scenes")
-_parser.add_argument("--rivals", action="store_true", help="MJX and Brax too, where they are (ten minutes more)")
+_parser.add_argument("--rivals", action="store_true", help="MJX and Brax too, where they are (twenty minutes more)")
+_parser.add_argument("--of", nargs=2, metavar=("RIVAL", "WORLDS"), help=argparse.SUPPRESS)  # what --rivals calls
 _parser.add_argument("--repeats", type=int, default=5, metavar="N", help="timed runs of each side (default 5)")
 _parser.add_argument("--out", type=pathlib.Path, default=None, metavar="DIR", help="default benchmarks/results")
 if __name__ == "__main__":
@@ -420,26 +423,47 @@ RIVALS = {
 }
 
 
-def rival_rows(rival, name, env):
-    """Rows of another engine on the same scene and start states: its best batch; an error is kept as the reason."""
-    same = {**env, "benchmark": rival, "scene": name, "dt": DT, "dtype": "float32"}
+#: Worlds from which on an engine only gets slower on two cores.
+MOST = {"mjx": 1024}
+#: Seconds that another engine has for one batch, with its compilation; several minutes at its slowest here.
+PATIENCE = 150
+
+
+def rival_row(rival, name, size) -> dict:
+    """Times of another engine on the same scene and start states, in this process."""
     scene, worlds = SCENES[name][0]()
     model, one = rbd.build(scene, dt=DT, method="fast")
-    batches, steps = RIVAL_RUNS[name]
+    steps = RIVAL_RUNS[name][1]
+    run, start = RIVALS[rival][1](scene, steps)(model, worlds(one, size, np.random.default_rng(1)))
+    begin = time.perf_counter()
+    compiled = jax.jit(run).lower(*start).compile()
+    compile_s = time.perf_counter() - begin
+    (times,) = in_turn([lambda: jax.block_until_ready(compiled(*start))], 3)
+    took = {"ns_per_world_step": float(1e9 * np.median(times) / size / steps)}
+    return {"steps": steps, **spread(times), "compile_s": compile_s, **took}
+
+
+def rival_rows(rival, name, env):
+    """Rows of another engine; an error is kept as the reason.
+
+    Every batch in a process of its own that may be ended: MJX, which calls for linear algebra, can wait for itself for
+    ever on two cores.
+    """
+    same = {**env, "benchmark": rival, "scene": name, "dt": DT, "dtype": "float32"}
     rows = []
-    for size in batches:
+    for size in (n for n in RIVAL_RUNS[name][0] if n <= MOST.get(rival, n)):
+        call = [sys.executable, __file__, "--scenes", name, "--of", rival, str(size)]
         try:
-            run, start = RIVALS[rival][1](scene, steps)(model, worlds(one, size, np.random.default_rng(1)))
-            begin = time.perf_counter()
-            compiled = jax.jit(run).lower(*start).compile()
-            compile_s = time.perf_counter() - begin
-            (times,) = in_turn([lambda: jax.block_until_ready(compiled(*start))], 3)
-        except Exception as error:
-            return [*rows, {**same, "batch": size, "reason": f"{type(error).__name__}: {str(error)[:200]}"}]
-        rows.append({**same, "batch": size, "steps": steps, **spread(times), "compile_s": compile_s,
-                     "ns_per_world_step": 1e9 * np.median(times) / size / steps})  # fmt: skip
-        took = rows[-1]["ns_per_world_step"]
-        print(f"{name:11s} {rival:15s} {size:6d} {took:9.0f} ns  compile {compile_s:.1f} s", flush=True)
+            done = subprocess.run(call, capture_output=True, text=True, timeout=PATIENCE, check=False)
+            found = json.loads(done.stdout.splitlines()[-1])
+        except subprocess.TimeoutExpired:
+            found = {"reason": f"no end within {PATIENCE} s"}
+        except (IndexError, json.JSONDecodeError):
+            found = {"reason": (done.stderr.strip().splitlines() or ["it said nothing"])[-1][:200]}
+        rows.append({**same, "batch": size, **found})
+        took, compile_s = found.get("ns_per_world_step"), found.get("compile_s")
+        said = found.get("reason") or f"{took:9.0f} ns  compile {compile_s:.1f} s"
+        print(f"{name:11s} {rival:15s} {size:6d} {said}", flush=True)
     return rows
 
 
@@ -580,6 +604,9 @@ def main(args) -> int:
     out = args.out or common.RESULTS
     env = common.environment() | {"sharded_over": args.devices}
     chosen = [s for s in args.scenes.split(",") if s] or [*SCENES, "ten_boxes"]
+    if args.of:
+        print(json.dumps(rival_row(args.of[0], chosen[0], int(args.of[1]))))
+        return 0
     unknown = [s for s in chosen if s not in TITLES]
     if unknown:
         print(f"unknown scene {unknown[0]!r}; known: {', '.join(TITLES)}", file=sys.stderr)
