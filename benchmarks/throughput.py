@@ -423,8 +423,12 @@ RIVALS = {
 }
 
 
-#: Worlds from which on an engine only gets slower on two cores.
-MOST = {"mjx": 1024}
+#: Batches of an engine on a scene where the others do not fit: MJX only gets slower with more worlds on two cores.
+BATCHES = {
+    **{("mjx", name): (256, 1024) for name in ("ball", "isotropic", "asymmetric")},
+    ("mjx", "clutter"): (1, 16),
+    ("mjx", "pile16"): (1, 8),
+}
 #: Seconds that another engine has for one batch, with its compilation; several minutes at its slowest here.
 PATIENCE = 150
 
@@ -451,7 +455,7 @@ def rival_rows(rival, name, env):
     """
     same = {**env, "benchmark": rival, "scene": name, "dt": DT, "dtype": "float32"}
     rows = []
-    for size in (n for n in RIVAL_RUNS[name][0] if n <= MOST.get(rival, n)):
+    for size in BATCHES.get((rival, name), RIVAL_RUNS[name][0]):
         call = [sys.executable, __file__, "--scenes", name, "--of", rival, str(size)]
         try:
             done = subprocess.run(call, capture_output=True, text=True, timeout=PATIENCE, check=False)

@@ -111,7 +111,7 @@ def rollout(
       traj: a State of ``steps // every + 1`` samples, the first the initial state; leaves
         (batch..., samples, n), without memory.
 
-    A world that is not finite, or whose state exceeds 7e12 (float32; 6e102 in float64) in norm, is frozen at its last
+    A world that is not finite, or whose state exceeds 2.6e6 (float32; 2.4e51 in float64) in norm, is frozen at its last
     state in range, from the start if it was so given, with the status NOT_FINITE. Its derivative is that of this
     state: the identity with respect to the state at which it froze, zero with respect to model and control
     since. Derivatives of other worlds and of numbers that all worlds share are not affected (up to second derivatives
