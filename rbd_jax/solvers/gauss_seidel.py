@@ -133,21 +133,8 @@ def _placed(lam: Impulses, g: Group) -> Impulses:
     where = g.plan or g.lanes
     if where is None:
         return lam
-    pairs = len(where.place)
-    lam = jax.tree.map(lambda c: jnp.broadcast_to(c, (g.rows.slots, pairs, g.rows.phi.shape[-1])), lam)
-
-    def at(source):
-        return jax.tree.map(lambda c: jnp.where(source < pairs, c, 0.0), arranged(lam, source, pairs))
-
-    return in_blocks(at, None if g.lanes is None else g.lanes.filled, where.source)
-
-
-def _places(c: jax.Array, index: jax.Array) -> jax.Array:
-    """c (..., P, B or 1) at ``index`` (Q, B) of its pair axis."""
-    if c.shape[-1] == 1:
-        c = jnp.take(c[..., 0], index, axis=-1, mode="clip")
-        return c
-    return jnp.take_along_axis(c, index.reshape((1,) * (c.ndim - 2) + index.shape), axis=-2, mode="clip")
+    lam = jax.tree.map(lambda c: jnp.broadcast_to(c, (g.rows.slots, *where.place.shape)), lam)
+    return _found(lam, where.source, len(where.place), None if g.lanes is None else g.lanes.filled)
 
 
 def _restored(lam: Impulses, g: Group, filled: jax.Array | None) -> Impulses:
@@ -155,14 +142,27 @@ def _restored(lam: Impulses, g: Group, filled: jax.Array | None) -> Impulses:
     where = g.plan or g.lanes
     if where is None:
         return lam
-    places = len(where.source)
-    at = lambda place: jax.tree.map(lambda c: jnp.where(place < places, c, 0.0), arranged(lam, place, places))
     if g.lanes is not None and filled is None:
         filled = len(where.place)
-    return in_blocks(at, filled, where.place)
+    return _found(lam, where.place, len(where.source), filled)
+
+
+def _found(lam: Impulses, source: jax.Array, count: int, filled: jax.Array | None) -> Impulses:
+    """The impulses that ``source`` names, zero where that is ``count``; of one world the first ``filled`` of them."""
+    at = lambda source: jax.tree.map(lambda c: jnp.where(source < count, c, 0.0), arranged(lam, source, count))
+    return in_blocks(at, filled, source)
+
+
+def _places(c: jax.Array, index: jax.Array) -> jax.Array:
+    """c (..., P, B or 1) at ``index`` (Q, B) of its pair axis."""
+    if c.shape[-1] == 1:
+        return jnp.take(c[..., 0], index, axis=-1, mode="clip")
+    return jnp.take_along_axis(c, index.reshape((1,) * (c.ndim - 2) + index.shape), axis=-2, mode="clip")
 
 
 def prepare(rows: Rows, problem: Problem) -> Group:
+    """The group in the order in which it is solved: by colours that are known before, or of a plan; in a program that
+    is one function point after point, many pairs of one world in lanes."""
     fixed = isinstance(rows.b, Index)
     n, pairs = problem.v.x.shape[0], rows.phi.shape[1]
     if not (in_one_function() and (fixed or rows.b.shape[1] == 1)):
