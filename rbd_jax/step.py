@@ -625,7 +625,7 @@ def _correction(p: Params, problem: Problem, solution: Solution, v0: Vec3, v1: V
     sliding distance second order without lifting or sinking.
     """
     push = zeros_like(v0)
-    if single.applies(problem):
+    if single.applies(problem):  # one contact a body: the direction is its normal, no quotient need be taken
         (rows,), (lam,) = problem.rows, solution.contacts
         n = spread(push, rows, rows.n * jnp.where(lam.n[0] > 0, 1.0, 0.0).astype(v0.x.dtype))
         d = (v0 - v1) * (0.5 * p.h)

@@ -170,11 +170,9 @@ def _words(a: Bounds, b: Bounds, balls: bool, allowed: np.ndarray | None) -> jax
     """uint32 (count_a / 32, count_b, B): 32 geoms of side A to a word, a bit where the pair is close."""
     count_a, count_b = len(a), len(b)
     worlds = max(c.shape[1] for c in jax.tree.leaves((a, b)))
-    pad = -count_a % WORD
     words = -(-count_a // WORD)
-    # bits along the slow axis: the fast ones (geoms of B, worlds) are vectors; what is padded is infinitely far
-    fit = lambda c: jnp.pad(c, ((0, pad), (0, 0)), constant_values=jnp.inf).reshape(words, WORD, 1, c.shape[1])
-    a = Bounds(a.x.map(fit), a.half.map(lambda c: jnp.pad(c, ((0, pad), (0, 0))).reshape(words, WORD, 1, c.shape[1])))
+    # bits along the slow axis: the fast ones (geoms of B, worlds) are vectors
+    a = jax.tree.map(lambda c: c.reshape(words, WORD, 1, c.shape[1]), _far(a, words * WORD))
     b = jax.tree.map(lambda c: c[None, None], b)
     found = jnp.broadcast_to(close(a, b, balls), (words, WORD, count_b, worlds))
     weight = (np.uint32(1) << np.arange(WORD, dtype=np.uint32))[None, :, None, None]
@@ -258,9 +256,8 @@ def pairs_of_one(a: Bounds, b: Bounds, balls: bool, allowed: np.ndarray | None, 
 
 def _far(x: Bounds, size: int) -> Bounds:
     """``x`` with geoms infinitely far away until there are ``size``."""
-    pad = lambda c, value: jnp.pad(c, ((0, size - c.shape[0]), (0, 0)), constant_values=value)
-    whole = lambda c: jnp.broadcast_to(c, (len(x), 1))
-    return Bounds(x.x.map(lambda c: pad(whole(c), jnp.inf)), x.half.map(lambda c: pad(whole(c), 0)))
+    pad = lambda c, value: jnp.pad(c, ((0, size - len(c)), (0, 0)), constant_values=value)
+    return Bounds(x.x.map(lambda c: pad(c, jnp.inf)), x.half.map(lambda c: pad(c, 0)))
 
 
 def grid_pairs(a: Bounds, b: Bounds | None, balls: bool, allowed: np.ndarray | None, capacity: int, candidates: int):
