@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import copy
 import datetime
 import json
 import os
@@ -293,6 +294,25 @@ class MuJoCo:
             mujoco.mj_fwdPosition(self.model, data)
             deepest = max(deepest, float(-data.contact.dist.min(initial=0.0)))
         return deepest
+
+    def normal_speeds(self, qpos, qvel, near: float = 1e-5) -> np.ndarray:
+        """Largest speed along the normal [m/s] of points closer than ``near`` [m] in each world of (B, nq), (B, nv).
+
+        0 where there are none.
+        """
+        model = copy.copy(self.model)
+        model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC  # the first row of a contact is its normal there
+        model.geom_margin[:] = model.pair_margin[:] = near
+        data = mujoco.MjData(model)
+
+        def fastest(q, v):
+            data.qpos[:], data.qvel[:] = q, v
+            mujoco.mj_fwdPosition(model, data)
+            mujoco.mj_fwdVelocity(model, data)
+            rows = data.contact.efc_address
+            return np.abs(data.efc_vel[rows[rows >= 0]]).max(initial=0.0)
+
+        return np.array([fastest(q, v) for q, v in zip(qpos, qvel, strict=True)])
 
     def close(self):
         self.pool.close()

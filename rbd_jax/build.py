@@ -12,7 +12,7 @@ import numpy as np
 
 from .contact import NARROW
 from .contact.broadphase import SLOP, bits, key_of, no_key
-from .method import SMOOTHING, Method, find
+from .method import SMOOTHING, Method, Touching, find
 from .model import Choice, Group, Model, Structure
 from .scene import Scene, resolve, rotation
 from .shapes import SHAPES
@@ -60,7 +60,7 @@ def build(scene: Scene, dt: float | None = None, method: str | Method = "accurat
     if not (np.isfinite(dt) and dt > 0):
         raise ValueError(f"build: dt = {dt} must be finite and > 0 [s]")
     r = resolve(scene)
-    method = find(method).resolve(dt, scene.integrator, *_boxes_that_touch(r), touch=len(r.pairs) > 0)
+    method = find(method).resolve(dt, scene.integrator, _touching(r))
     dtype = jnp.result_type(float)
     n = len(r.mass)
 
@@ -224,18 +224,26 @@ def _needs_attitude(r, groups, kinds, category, centred) -> bool:
 # --- pairs ---
 
 
-def _boxes_that_touch(r) -> tuple[int, float, float, bool]:
-    """Number of bodies whose boxes may touch another body's, the smallest edge of these boxes [m], their mass ratio,
-    and whether bodies touch each other with nothing but boxes."""
+def _touching(r) -> Touching:
+    if not len(r.pairs):
+        return Touching(anything=False)
     box = np.array([s.kind == "box" for s in r.geom_shapes])
     moving = np.array(["dynamic", "kinematic", "static"])[r.geom_category] == "dynamic"
-    geoms = np.unique(r.pairs[(box & moving)[r.pairs].all(axis=1)]) if len(r.pairs) else []
-    if not len(geoms):
-        return 0, 1.0, 1.0, False
-    bodies = np.unique(r.geom_body[geoms])
-    size = 2.0 * min(min(r.geom_shapes[g].half_extents) for g in geoms)
-    alone = box[r.pairs[moving[r.pairs].all(axis=1)]].all()
-    return len(bodies), size, r.mass[bodies].max() / r.mass[bodies].min(), bool(alone)
+    between = r.pairs[moving[r.pairs].all(axis=1)]
+    if not len(between):
+        return Touching()
+    alone = box[between].all(axis=1)
+    ratio = lambda geoms: (lambda m: float(m.max() / m.min()))(r.mass[r.geom_body[geoms]])
+    if not alone.any():
+        return Touching(ratio=ratio(between))
+    geoms = np.unique(between[alone])
+    return Touching(
+        boxes=len(np.unique(r.geom_body[geoms])),
+        size=2.0 * min(min(r.geom_shapes[g].half_extents) for g in geoms),
+        box_ratio=ratio(geoms),
+        ratio=ratio(between),
+        alone=bool(alone.all()),
+    )
 
 
 def _groups(r, kinds, category, centred, method: Method, scene: Scene, dt: float) -> tuple[Group, ...]:

@@ -7,6 +7,7 @@ import math
 
 from .integrators import Integrator, Splitting, make as make_integrator
 from .solvers import CONTACT_MODELS, SOLVERS, TGS, ContactModel, NewtonLagged, Solver
+from .solvers.laws import Soft
 
 #: Longest substep of ``substeps=None`` with a solver that is better split than solved harder [s].
 SUBSTEP = 1.0 / 240.0
@@ -14,13 +15,38 @@ SUBSTEP = 1.0 / 240.0
 STACK, STACK_SIZE = 8, 0.2
 #: and masses up to this ratio;
 RATIO = 10.0
+#: contacts of ``Soft`` carry masses up to this ratio: balls, four of 100 on twelve of 1 in a bin, overlap by 4 mm and
+#: jump about at 0.1 m/s. Where it is larger, on contacts that yield more, they come to rest (and overlap by 13 mm).
+HEAVY_RATIO, HEAVY = 5.0, Soft.uniform(0.25, 10.0)
 #: a direct solve costs less than the substeps of a larger one up to this many boxes.
 DIRECT = 64
-#: Sweeps of so many boxes less one; with two, a stack of four or five rocks at 0.1 m/s for seconds.
+#: Two sweeps, and one more for every two boxes after the first, up to so many: with one less a stack of three or four
+#: rocks at 0.05 m/s for seconds.
 MOST_SWEEPS = 4
-#: Newton steps of a direct solve: with four the time at which a row of dominoes falls is off by 0.8 % instead of 0.6;
-#: with eight a bin of boxes and balls takes a third longer for the same overlap.
-NEWTON = 6
+#: Newton steps of a direct solve: with six, two stacks that collide gain 0.0012 M g d in a step instead of 0.0006, and
+#: the speed at which dominoes fall changes by 3.9 % with half the step instead of 1.1; with eight a bin of boxes and
+#: balls takes a third longer than with six for the same overlap.
+NEWTON = 7
+
+
+@dataclasses.dataclass(frozen=True)
+class Touching:
+    """What of a scene decides which solver is the cheapest that stands.
+
+    Attributes:
+      anything: whether anything may touch anything.
+      boxes, size, box_ratio: number of bodies whose boxes may touch another body's, the smallest edge of one of these
+        boxes [m], the largest of their masses over the smallest.
+      ratio: the same of all bodies that may touch another body.
+      alone: whether bodies touch each other with nothing but boxes.
+    """
+
+    anything: bool = True
+    boxes: int = 0
+    size: float = 1.0
+    box_ratio: float = 1.0
+    ratio: float = 1.0
+    alone: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +62,8 @@ class Method:
         "newton_lagged" with up to six Newton steps where 2 to 64 boxes may touch each other and bodies may touch
         each other with nothing else, or where sweeps would need substeps for these boxes, which is where
         dt > 1/240 s min(1, 8 / boxes) min(1, sqrt(size / 0.2 m)) or where their masses differ by more than 10 : 1; else
-        "tgs", with two to four sweeps for three to five and more boxes.
+        "tgs", with two sweeps, three from three boxes on and four from five on, and contacts that yield more where
+        masses of bodies that may touch each other differ by more than 5 : 1.
       substeps: steps inside a step of dt; None: 1, or for "tgs" and "penalty" as many as keep a substep within
         1/240 s at the dt of ``build`` where anything may touch anything.
       events: with pairs that mention restitution, impacts a world may have in a (sub)step at their own instant, with
@@ -60,46 +87,38 @@ class Method:
         """Which contact slots are alive, see ``detect.detect``: smoothed contact acts from a distance."""
         return "all" if self.solver.smoothing else self.contact.reach
 
-    def resolve(
-        self,
-        dt: float,
-        scene_integrator: str | None = None,
-        boxes: int = 0,
-        size: float = 1.0,
-        ratio: float = 1.0,
-        alone: bool = False,
-        touch: bool = True,
-    ) -> Method:
+    def resolve(self, dt: float, scene_integrator: str | None = None, touching: Touching | None = None) -> Method:
         """Names replaced by instances and ``substeps`` by a number.
 
         Args:
-          dt: step [s]. scene_integrator: what "scene" stands for.
-          boxes, size, ratio: number of boxes that may touch each other, the smallest edge of one [m], the
-            largest mass over the smallest. alone: whether bodies touch each other with nothing but boxes.
-          touch: whether anything may touch anything.
+          dt: step [s]. scene_integrator: what "scene" stands for. touching: None: any two things may, none is a box.
 
         Raises:
           ValueError: an unknown name, a combination of model and solver that does not exist,
             substeps < 1 or capacity < 1.
         """
+        t = touching or Touching()
         integrator = self.integrator
         if integrator == "scene":
             integrator = "mujoco_" + (scene_integrator or "euler")
         integrator = make_integrator(integrator)
-        solver = self.solver
+        solver, contact = self.solver, self.contact
         if solver is None:
-            longest = SUBSTEP * min(1.0, STACK / max(boxes, 1)) * min(1.0, math.sqrt(size / STACK_SIZE))
-            direct = 2 <= boxes <= DIRECT and (alone or dt > longest or ratio > RATIO)
-            solver = TGS(sweeps=min(max(boxes - 1, 2), MOST_SWEEPS))
-            if direct and self.contact in (None, "near_rigid"):
+            longest = SUBSTEP * min(1.0, STACK / max(t.boxes, 1)) * min(1.0, math.sqrt(t.size / STACK_SIZE))
+            direct = 2 <= t.boxes <= DIRECT and (t.alone or dt > longest or t.box_ratio > RATIO)
+            if direct and contact in (None, "near_rigid"):
                 solver = NewtonLagged(iterations=NEWTON)
+            else:
+                solver = TGS(sweeps=min(2 + max(t.boxes - 1, 0) // 2, MOST_SWEEPS))
+                if contact is None and t.ratio > HEAVY_RATIO:
+                    contact = HEAVY
         if isinstance(solver, str):
             if solver not in SOLVERS:
                 raise ValueError(f"Method: unknown solver '{solver}'; known: {', '.join(SOLVERS)}")
             solver = SOLVERS[solver]()
         if not isinstance(solver, Solver):
             raise ValueError(f"Method: solver = {solver!r} must be a name or a Solver")
-        contact = self.contact or solver.contact
+        contact = contact or solver.contact
         if isinstance(contact, str):
             if contact not in CONTACT_MODELS:
                 raise ValueError(f"Method: unknown contact model '{contact}'; known: {', '.join(CONTACT_MODELS)}")
@@ -122,7 +141,7 @@ class Method:
             )
         substeps = self.substeps
         if substeps is None:
-            substeps = max(1, round(dt / SUBSTEP + 0.49)) if solver.substeps and touch else 1
+            substeps = max(1, round(dt / SUBSTEP + 0.49)) if solver.substeps and t.anything else 1
         if substeps > MAX_SUBSTEPS:
             raise ValueError(f"Method: dt = {dt} s needs {substeps} substeps, at most {MAX_SUBSTEPS}: use a smaller dt")
         return Method(integrator, contact, solver, substeps, self.capacity, self.events)

@@ -539,6 +539,7 @@ def _problem(p: Params, old: Bodies, v: Vec3, turning, contacts) -> Problem:
         q=old.q,
         inertia=p.inertia,
         inv_inertia=inverse,
+        stacked=any(c.rows.slots > 1 for c in contacts) and any(c.rows.a is not None for c in contacts),
     )
 
 

@@ -31,6 +31,7 @@ class Problem:
         impacts among them. None = unknown.
       smoothing: (normal, slip) speeds [m/s] over which a solver that smooths does so, each (1,) or (B,).
       contact: the ``laws.ContactModel``, None = the solver's own.
+      stacked: whether what touches at several points, as boxes do, may carry other bodies.
       one: an array equal to 1 that XLA cannot see through, see ``rbd_jax.xla.materialise``.
     """
 
@@ -50,6 +51,7 @@ class Problem:
     inv_inertia: InverseInertia | None = None
     smoothing: tuple | None = None
     contact: object = static(default=None)
+    stacked: bool = static(default=False)
 
     @property
     def loads(self) -> tuple:

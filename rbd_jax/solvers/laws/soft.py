@@ -1,8 +1,11 @@
-"""Layer 5: soft contact, a critically overdamped spring by frequency and damping ratio.
+"""Layer 5: soft contact, an overdamped spring by frequency and damping ratio.
 
 With om = 2 pi f h and zeta: vhat = -om / (2 zeta + om) phi / h, r = w / (om (2 zeta + om)).
+At rest a point overlaps by (w p / h g) g h^2 / om^2 under the impulse p a step; the share om / (2 zeta + om) of an
+overlap is taken back a step.
 Source: Catto, "Soft constraints" (GDC 2011) and Box2D v3. Differs: ``Soft`` ties the frequency to the
-step (a quarter of its rate) without a cap, so that heavy loads stand. A gap is a rigid row.
+step without a cap, so that heavy loads stand, and has springs of its own for pairs of several points. A gap is a rigid
+row.
 """
 
 from __future__ import annotations
@@ -17,24 +20,45 @@ from .base import ContactModel, Law, points, recovery, spring_energy
 
 @dataclasses.dataclass(frozen=True)
 class Soft(ContactModel):
-    """As stiff as the step resolves.
+    """As stiff as a few sweeps bear: stiffer, and a box that is pushed rocks, and so does a column of boxes.
 
-    stiffness: contact frequency times the step [-]. damping_ratio [-]. push_speed: bound of the
+    A spring is a pair of numbers: contact frequency times the step [-] and damping ratio [-].
+
+    stiffness, damping_ratio: of pairs of one point, as spheres have. push_speed: bound of the
     speed at which a contact resolves overlap [m/s]; bodies part at up to ``EXIT`` times this.
+    face: spring of pairs of several points, as boxes have. stacked: the same where bodies may touch each other, with
+    fixed geometry and between bodies; sweeps are slowest there.
     """
 
-    stiffness: float = 0.25
-    damping_ratio: float = 10.0
+    stiffness: float = 0.75
+    damping_ratio: float = 30.0
     push_speed: float = 2.0
+    face: tuple[float, float] = (0.6, 5.0)
+    stacked: tuple[tuple[float, float], tuple[float, float]] = ((0.43, 17.0), (0.25, 10.0))
 
     name = "soft"
     reach = "nearby"
 
+    @classmethod
+    def uniform(cls, stiffness: float, damping_ratio: float) -> Soft:
+        """The same spring for all pairs."""
+        spring = stiffness, damping_ratio
+        return cls(*spring, face=spring, stacked=(spring, spring))
+
+    def spring(self, rows, problem) -> tuple[float, float]:
+        """Stiffness and damping ratio of a group of pairs."""
+        if rows.slots == 1:
+            return self.stiffness, self.damping_ratio
+        if not problem.stacked:
+            return self.face
+        return self.stacked[0 if rows.a is None else 1]
+
     def law(self, rows, w, problem, load=None) -> Law:
-        om = 2.0 * math.pi * self.stiffness
-        stiff = om * (2.0 * self.damping_ratio + om)
-        vhat = recovery(rows.phi, problem, om / (2.0 * self.damping_ratio + om), self.push_speed)
-        return Law(vhat, jnp.where(rows.phi <= 0, w / stiff, 0.0))
+        stiffness, damping_ratio = self.spring(rows, problem)
+        om = 2.0 * math.pi * stiffness
+        both = 2.0 * damping_ratio + om
+        vhat = recovery(rows.phi, problem, om / both, self.push_speed)
+        return Law(vhat, jnp.where(rows.phi <= 0, w / (om * both), 0.0))
 
 
 @dataclasses.dataclass(frozen=True)
