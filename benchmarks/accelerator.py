@@ -180,7 +180,7 @@ class Errors:
         rival = MuJoCo(scene, throughput.DT)
         judge = throughput.contact_errors if scene.static else throughput.free_errors
         try:
-            self.found = judge(self.name, rival, model, one, throughput.RUNS_OF_ERROR, worlds, self.args)
+            self.found = judge(self.name, scene, rival, model, one, throughput.RUNS_OF_ERROR, worlds, self.args)
         finally:
             rival.close()
 
@@ -208,7 +208,7 @@ def report(env, rates, rows, wrong, rivals, took) -> str:
         against.append([throughput.TITLES[name], what, number(best[name]["ns"]), number(ratio), f"{MJX_BAR:g}",
                         verdict(ratio, MJX_BAR, least=True) if top else ""])  # fmt: skip
     seen = [
-        [throughput.TITLES[name], throughput.QUANTITIES[key], number(value["ours"]), number(value["mujoco"])]
+        [throughput.TITLES[name], throughput.QUANTITIES[key][0], number(value["ours"]), number(value["mujoco"])]
         for name, found in wrong.items() for key, value in found.items() if isinstance(value, dict)
     ]  # fmt: skip
     free = max((r.get("issue_share", r["bytes_share"]) for r in rows if r["scene"] == "isotropic"), default=None)

@@ -59,7 +59,7 @@ class Method:
         "spring", "mujoco") or an instance; None: the solver's own.
       solver: a name of ``rbd_jax.SOLVERS`` ("tgs", "pgs", "newton_lagged", "newton_cone", "penalty", "mujoco") or an
         instance. Any goes with any model, but "mujoco", which speaks its own only. None: the cheapest that stands:
-        "newton_lagged" with up to six Newton steps where 2 to 64 boxes may touch each other and bodies may touch
+        "newton_lagged" with up to seven Newton steps where 2 to 64 boxes may touch each other and bodies may touch
         each other with nothing else, or where sweeps would need substeps for these boxes, which is where
         dt > 1/240 s min(1, 8 / boxes) min(1, sqrt(size / 0.2 m)) or where their masses differ by more than 10 : 1; else
         "tgs", with two sweeps, three from three boxes on and four from five on, and contacts that yield more where

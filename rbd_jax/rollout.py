@@ -27,6 +27,7 @@ from .spread import any_traced, first_changing, lowered_share, means, over_cores
 from .state import State, World, Wrench
 from .step import (
     advance,
+    advance_in_blocks,
     enter,
     grown,
     harmless,
@@ -41,7 +42,7 @@ from .step import (
     with_memory,
 )
 from .tiles import tiled
-from .xla import no_collections, on_cpu
+from .xla import loops_are_cheap, no_collections, on_cpu
 
 
 def step(model: Model, state: State, control=None) -> State:
@@ -321,6 +322,8 @@ def _loop(model, state, batch, wrench, length, ask, blocks, truncate, nudge):
         if blocks:
             return _in_blocks(run, world, cuts, count, blocks[0], blocks[1:])
         if ask is None and cuts is None:
+            if loops_are_cheap() and not (isinstance(count, int) and count == 1):
+                return advance_in_blocks(model, p, world, hot, count), None
             once = _advance(model.structure, model.method)
             return repeated(once, world, p, hot, worlds=math.prod(batch), count=count), None
         if count == 1:

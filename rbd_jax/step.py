@@ -283,6 +283,37 @@ def advance(model: Model, p: Params, world: World, wrench: Wrench | None) -> Wor
     return watched(model, p, world, wrench, None)[0]
 
 
+#: Steps of a block after which is asked whether a world was lost in it. To ask after every step, and to choose between
+#: two states, takes a third of the time of a ball.
+BLOCK = 64
+
+
+def advance_in_blocks(model: Model, p: Params, world: World, wrench: Wrench | None, count) -> World:
+    """``advance``, ``count`` times (may be traced): the same worlds, lost ones held; not to be differentiated.
+
+    A block in which a world is lost is taken again, step by step.
+    """
+
+    def step(_, carry):
+        world, largest = carry
+        new, _ = substeps(model, p, world, wrench)
+        # of the state that is there, not of the new one, which would be computed again for it
+        return new._with(step=new.step + 1), piece(_larger)(largest, world, p)
+
+    def block(carry):
+        done, singly, old = carry
+        careful = singly > 0
+        length = jnp.where(careful, 1, jnp.minimum(count - done, BLOCK))
+        new, largest = repeat(0, length, step, (old, jnp.zeros_like(_square(old, p))))
+        kept, ok = _kept(old, new, _larger(largest, new, p))
+        taken = careful | (ok | _is_lost(old)).all()
+        singly = jnp.where(taken, jnp.maximum(singly - 1, 0), BLOCK)
+        return done + jnp.where(taken, length, 0), singly, where(taken, kept, old)
+
+    start = (jnp.int32(0), jnp.int32(0), world)
+    return jax.lax.while_loop(lambda carry: carry[0] < count, block, start)[2]
+
+
 def watched(model: Model, p: Params, world: World, wrench: Wrench | None, watch):
     """``advance``, and what ``watch`` returned for every substep, leaves (substeps, ..., B); None for no watch.
 
@@ -403,7 +434,28 @@ def _freeze(old: World, new: World, p: Params) -> tuple[World, jax.Array]:
 
     Also whether a world made the step, (B,).
     """
-    bodies = new.bodies
+    return _kept(old, new._with(step=new.step + 1), materialise(_square(new, p), p.one))
+
+
+def _kept(old: World, new: World, square: jax.Array) -> tuple[World, jax.Array]:
+    """``new``, or ``old`` where a world was lost before or now (``square``: of its size, squared); where it is new."""
+    fits = square <= limit(square.dtype) ** 2  # false for NaN
+    ok = fits & ~_is_lost(old)
+    status = jnp.where(_is_lost(old), old.status, jnp.where(fits, new.status, new.status | jnp.uint32(FROZEN)))
+    return where(ok, new, old)._with(status=status), ok
+
+
+def _larger(square: jax.Array, world: World, p: Params) -> jax.Array:
+    return jnp.maximum(square, _square(world, p))  # NaN stays
+
+
+def _is_lost(world: World) -> jax.Array:
+    return (world.status & jnp.uint32(FROZEN)) != 0
+
+
+def _square(world: World, p: Params) -> jax.Array:
+    """Size of every world, squared, see ``limit``; (B,)."""
+    bodies = world.bodies
     squares = [c * c for c in jax.tree.leaves(bodies._with(L=None))]
     if bodies.L is not None:
         moments = p.inertia.moments
@@ -411,12 +463,7 @@ def _freeze(old: World, new: World, p: Params) -> tuple[World, jax.Array]:
         squares.append(bodies.L.dot(bodies.L) * (1.0 / (least * least)))
     while len(squares) > 1:  # in pairs: of one world the next step waits for the sum, and in a row each for the other
         squares = [functools.reduce(jnp.add, squares[i : i + 2]) for i in range(0, len(squares), 2)]
-    size = materialise(summed(squares[0]), p.one)
-    fits = size <= limit(size.dtype) ** 2  # false for NaN
-    ok = fits & ((new.status & jnp.uint32(FROZEN)) == 0)
-    status = jnp.where(fits, new.status, new.status | jnp.uint32(FROZEN))
-    kept = where(ok, new._with(step=new.step + 1), old)
-    return kept._with(status=status), ok
+    return summed(squares[0])
 
 
 def _substep(model: Model, p: Params, world: World, wrench: Wrench | None, watch):

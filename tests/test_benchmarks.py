@@ -30,7 +30,7 @@ def test_throughput_writes_rows(tmp_path):
     for r in timed.values():
         assert {"date", "commit", "versions", "cpu", "cores", "dtype", "method", "batch", "dt", "iqr_s"} <= set(r)
         assert r["median_s"] > 0 and r["ratio"] > 0 and r["compile_total_s"] > 0 and r["mujoco"]["median_s"] > 0
-    assert {"penetration_m", "residual_speed_m_s", "rolling_speed_error"} <= set(timed["ball"]["error"])
+    assert {"penetration_m", "normal_speed_m_s", "rolling_speed_error"} <= set(timed["ball"]["error"])
     assert "attitude_error_rad" in timed["isotropic"]["error"]
     assert "ball on a plane" in (tmp_path / "throughput.md").read_text()
 

@@ -7,6 +7,7 @@ import pytest
 import scenes
 
 import rbd_jax as rbd
+from rbd_jax.step import limit
 
 G = 9.81
 PRESETS = ["fast", "accurate"]
@@ -282,6 +283,28 @@ def test_angular_momentum_survives_single_steps(shape):
     many = jax.jit(lambda s: jax.lax.scan(lambda s, _: (rbd.step(model, s), None), s, None, length=100_000)[0])
     before, after = rbd.momentum(model, state)[1], rbd.momentum(model, many(state))[1]
     assert float(jnp.linalg.norm(after - before) / jnp.linalg.norm(before)) < 4e-5
+
+
+@pytest.mark.parametrize("worlds", [1, 33])
+def test_worlds_are_lost_at_the_step_at_which_they_are(worlds):
+    """A rollout asks for them once a block of steps, one that keeps every step at once: the same worlds are held at the
+    same states, wherever in a block one is lost and however many. Some are lost from the start."""
+    scene = rbd.Scene([rbd.Body("box", rbd.Box((0.1, 0.15, 0.2)), omega=(0.3, 0.2, 0.1))], gravity=None, dt=1.0)
+    model, state = rbd.build(scene, dt=1.0, method="fast")
+    after = np.resize([0.5, 1, 2, 30, 31, 32, 33, 34, 63, 64, 65, 66, 90, 1e9, 1e9], worlds) if worlds > 1 else [40.0]
+    vel = np.zeros((worlds, 1, 3), np.float32)
+    vel[:, 0, 0] = limit(np.float32) / (np.array(after) + 0.5)  # out of range after so many steps, or one less
+    vel[np.arange(worlds) % 11 == 10] = np.nan
+    start, steps = rbd.batch(state, worlds).replace(vel=vel), 96
+    final, _ = rbd.rollout(model, start, steps, every=steps)
+    for every in (1, 37):
+        other, _ = rbd.rollout(model, start, steps, every=every)
+        for name in ("pos", "vel", "omega", "quat", "step", "status"):
+            atol = 2e-5 if every == 1 and name in ("omega", "quat") else 0.0  # another program rounds otherwise
+            np.testing.assert_allclose(getattr(other, name), getattr(final, name), 0, atol, err_msg=f"{name}, {every}")
+    made = np.where(np.isnan(vel[:, 0, 0]), 0, np.minimum(np.floor(after), steps))
+    np.testing.assert_array_equal(np.asarray(final.status), np.where(made < steps, int(rbd.Status.NOT_FINITE), 0))
+    np.testing.assert_allclose(np.asarray(final.step), made, atol=1)
 
 
 def test_diverged_world_is_frozen_and_its_neighbours_do_not_notice(worlds):
