@@ -1,8 +1,8 @@
 """Layer 5: soft contact, an overdamped spring by frequency and damping ratio.
 
 With om = 2 pi f h and zeta: vhat = -om / (2 zeta + om) phi / h, r = w / (om (2 zeta + om)).
-At rest a point overlaps by (w p / h g) g h^2 / om^2 under the impulse p a step; the share om / (2 zeta + om) of an
-overlap is taken back a step.
+A point that carries the impulse p a step overlaps by w p h / om^2 at rest (g h^2 / om^2 where it carries a body of
+mass 1 / w); of more than that the share om / (2 zeta + om) is taken back a step.
 Source: Catto, "Soft constraints" (GDC 2011) and Box2D v3. Differs: ``Soft`` ties the frequency to the
 step without a cap, so that heavy loads stand, and has springs of its own for pairs of several points. A gap is a rigid
 row.
@@ -20,21 +20,21 @@ from .base import ContactModel, Law, points, recovery, spring_energy
 
 @dataclasses.dataclass(frozen=True)
 class Soft(ContactModel):
-    """As stiff as a few sweeps bear: stiffer, and a box that is pushed rocks, and so does a column of boxes.
+    """As stiff as two sweeps bear: stiffer, and a box that is pushed rocks, and so does a column of boxes.
 
     A spring is a pair of numbers: contact frequency times the step [-] and damping ratio [-].
 
     stiffness, damping_ratio: of pairs of one point, as spheres have. push_speed: bound of the
     speed at which a contact resolves overlap [m/s]; bodies part at up to ``EXIT`` times this.
     face: spring of pairs of several points, as boxes have. stacked: the same where bodies may touch each other, with
-    fixed geometry and between bodies; sweeps are slowest there.
+    fixed geometry and between bodies; sweeps are slowest there, and with three or four the former may be stiffer.
     """
 
     stiffness: float = 0.75
     damping_ratio: float = 30.0
     push_speed: float = 2.0
     face: tuple[float, float] = (0.6, 5.0)
-    stacked: tuple[tuple[float, float], tuple[float, float]] = ((0.43, 17.0), (0.25, 10.0))
+    stacked: tuple[tuple[float, float], tuple[float, float]] = ((0.25, 10.0), (0.25, 10.0))
 
     name = "soft"
     reach = "nearby"
