@@ -153,7 +153,7 @@ _compiled: set = set()
 
 
 def over_cores(core, count: int, model: Model, state: State, wrench: Wrench | None, counts, batch: tuple[int, ...]):
-    """``core(model, state, wrench, counts)`` with a share of the batch on each of ``count`` threads; waits for it."""
+    """``core(model, state, wrench, counts)`` with a share of the batch on each of ``count`` threads, the caller's too."""
     wide, device = jax.config.jax_enable_x64, jax.config.jax_default_device
 
     def part(first):
@@ -169,7 +169,9 @@ def over_cores(core, count: int, model: Model, state: State, wrench: Wrench | No
     if key not in _compiled:  # else every thread would compile the same program
         out.append(part(numbers.pop(0)))
         _compiled.add(key)
-    out += _pool(count).map(part, numbers)
+    others = [_pool(count).submit(part, k) for k in numbers[1:]]
+    out += [part(k) for k in numbers[:1]]  # a thread that only waits is a core that is woken late
+    out += [f.result() for f in others]
     return _joined(tuple(out), batch)
 
 
