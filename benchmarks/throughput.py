@@ -587,7 +587,7 @@ def report(env, rows, extra):
     ]
     rivals = []
     days = sorted({r["date"][:10] for r in rows if r["benchmark"] in RIVALS})
-    when = f"all of {', '.join(days)}, one run"
+    when = f"ours of the same run ({', '.join(days)})"
     for name, rival in {(r["scene"], r["benchmark"]): None for r in rows if r["benchmark"] in RIVALS}:
         title, _, bars = RIVALS[rival]
         theirs = [r for r in rows if r["benchmark"] == rival and r["scene"] == name]

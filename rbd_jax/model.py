@@ -112,6 +112,11 @@ class Structure:
         ).digest()
 
     @property
+    def uncoupled(self) -> bool:
+        """Whether nothing touches but single points of bodies and fixed geometry, so that a step is short."""
+        return all(g.slots == 1 and g.category != "dynamic" for g in self.groups)
+
+    @property
     def chooses(self) -> bool:
         """Whether a group chooses its pairs at run time by looking at all of them."""
         return any(g.choice is not None and g.choice.candidates is None for g in self.groups)

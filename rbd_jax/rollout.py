@@ -322,7 +322,8 @@ def _loop(model, state, batch, wrench, length, ask, blocks, truncate, nudge):
         if blocks:
             return _in_blocks(run, world, cuts, count, blocks[0], blocks[1:])
         if ask is None and cuts is None:
-            if loops_are_cheap() and not (isinstance(count, int) and count == 1):
+            single = isinstance(count, int) and count == 1
+            if loops_are_cheap() and model.structure.uncoupled and not single:
                 return advance_in_blocks(model, p, world, hot, count), None
             once = _advance(model.structure, model.method)
             return repeated(once, world, p, hot, worlds=math.prod(batch), count=count), None

@@ -153,7 +153,7 @@ _compiled: set = set()
 
 
 def over_cores(core, count: int, model: Model, state: State, wrench: Wrench | None, counts, batch: tuple[int, ...]):
-    """``core(model, state, wrench, counts)`` with a share of the batch on each of ``count`` threads, the caller's too."""
+    """``core(model, state, wrench, counts)``, a share of the batch on each of ``count`` threads, one the caller's."""
     wide, device = jax.config.jax_enable_x64, jax.config.jax_default_device
 
     def part(first):

@@ -291,7 +291,8 @@ BLOCK = 64
 def advance_in_blocks(model: Model, p: Params, world: World, wrench: Wrench | None, count) -> World:
     """``advance``, ``count`` times (may be traced): the same worlds, lost ones held; not to be differentiated.
 
-    A block in which a world is lost is taken again, step by step.
+    A block in which a world is lost is taken again, step by step. For steps that are short: around one of boxes the
+    second loop gains nothing, and it takes a third longer to compile.
     """
 
     def step(_, carry):
