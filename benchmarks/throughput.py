@@ -334,8 +334,9 @@ def contact_errors(name, scene, rival, model, one, size, worlds, args):
     both = lambda f: {"ours": f(*ours), "mujoco": f(*theirs)}
     out["penetration_m"] = both(lambda p, v: rival.penetration(p))
     if any(g.shape.kind == "sphere" for b in scene.bodies for g in b.geoms):  # a ball rolls on
-        out["normal_speed_m_s"] = both(lambda p, v: float(np.median(rival.normal_speeds(p, v))))
-        out["worst_normal_speed_m_s"] = both(lambda p, v: float(rival.normal_speeds(p, v).max()))
+        along = both(rival.normal_speeds)
+        out["normal_speed_m_s"] = {who: float(np.median(speeds)) for who, speeds in along.items()}
+        out["worst_normal_speed_m_s"] = {who: float(speeds.max()) for who, speeds in along.items()}
         out["speed_m_s"] = both(speed)
     else:
         out["residual_speed_m_s"] = both(speed)
@@ -478,9 +479,14 @@ def rival_rows(rival, name, env):
     return rows
 
 
+def kept(path) -> list[dict]:
+    """The rows of the runs before."""
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
+
+
 def last_run(path):
     """(environment, rows, times of other forms) of the last run in a file."""
-    known = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    known = kept(path)
     last = [r["date"] for r in known if r["benchmark"] == "throughput"][-1]
     rows, extra = [], {}
     for r in [r for r in known if r["date"] == last and r["benchmark"] not in RIVALS]:
@@ -490,9 +496,8 @@ def last_run(path):
 
 def earlier_rivals(path) -> list[dict]:
     """The last row of every batch of another engine on a scene, of the runs before, each with our time in its run."""
-    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else ()
     ours, found = {}, {}
-    for r in map(json.loads, lines):
+    for r in kept(path):
         run = r["scene"], r["commit"].rstrip("+"), r["date"][:10]
         if r["benchmark"] in RIVALS:
             found[r["scene"], r["benchmark"], r["batch"]] = r | {"ours_ns": ours.get(run)}
