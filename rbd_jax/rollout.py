@@ -222,7 +222,7 @@ def _step_batch(model: Model, state: State, wrench: Wrench | None, safe: bool = 
     batch = batch_of(model, state.batch_shape)
 
     def run(model, state):
-        p, world = enter(model, state, batch)
+        p, world = enter(model, state, batch, control=wrench)
         hot = _hot_wrench(wrench, batch, state.x.x.dtype)
         world = repeated(_advance(model.structure, model.method), world, p, hot, worlds=math.prod(batch), count=1)
         return leave(model, p, world, batch)
@@ -300,7 +300,7 @@ def _rollout_batch(
 
 def _loop(model, state, batch, wrench, length, ask, blocks, truncate, nudge):
     samples, every, rest, parts = length
-    p, world = enter(model, state, batch, parts)
+    p, world = enter(model, state, batch, parts, control=wrench)
     dtype = state.x.x.dtype
     hot = None if ask is not None else _hot_wrench(wrench, batch, dtype)
 

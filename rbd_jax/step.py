@@ -32,7 +32,7 @@ from .spatial import Quat, Vec3, where, zeros_like
 from .state import Memory, State, World, Wrench, to_hot, to_public
 from .status import Status
 from .struct import struct
-from .xla import materialise, opaque_one, part, piece, summed
+from .xla import for_each_world, materialise, opaque_one, part, piece, summed
 
 FROZEN = int(Status.NOT_FINITE)
 
@@ -183,17 +183,18 @@ def restored(state: State, given: State, lost: jax.Array) -> State:
 
 
 def enter(
-    model: Model, state: State, batch: tuple[int, ...], substeps: jax.Array | None = None
+    model: Model, state: State, batch: tuple[int, ...], substeps: jax.Array | None = None, control=None
 ) -> tuple[Params, World]:
     """Hot numbers and hot world of a public state whose leaves have batch axes ``batch``.
 
-    substeps: see ``params``.
+    substeps: see ``params``. control: any other numbers of the program, see ``opaque_one``.
     """
     s = model.structure
     state = grown(state, batch)
-    one = opaque_one(model.dt)
     hot = to_hot(state, batch)
-    p = params(model, batch, one, substeps)._with(one=one + 0.0 * hot.step.astype(one.dtype))
+    known = [value for _, value in model.leaves()]
+    one = opaque_one((known, state.x, state.v, state.q, state.w, state.step, control), model.dt.dtype)
+    p = params(model, batch, one, substeps)._with(one=for_each_world(one, hot.step.shape[0]))
     memory = hot.memory
     if s.attitude:
         q = hot.q if p.principal is None else hot.q @ p.principal

@@ -22,9 +22,20 @@ from jax.extend.core import Primitive
 from jax.interpreters.partial_eval import dce_jaxpr
 
 
-def opaque_one(x: jax.Array) -> jax.Array:
-    """A scalar 1 of x's dtype that the compiler cannot fold; x is any finite traced scalar."""
-    return jnp.exp(jax.lax.stop_gradient(x).ravel()[0] * 0)
+def opaque_one(tree, dtype) -> jax.Array:
+    """A scalar 1 that the compiler cannot fold, as long as it does not know one array of ``tree``, any numbers.
+
+    Of what a compiled function closes over it knows all numbers: to take one that it happens to know is to lose what
+    ``materialise`` is for.
+    """
+    first = [jax.lax.stop_gradient(c).ravel()[0].astype(dtype) for c in jax.tree.leaves(tree) if jnp.size(c)]
+    total = functools.reduce(jnp.add, first)
+    return jnp.exp(0.0 * jnp.where(jnp.isfinite(total), total, 0.0))
+
+
+def for_each_world(one: jax.Array, worlds: int) -> jax.Array:
+    """``one`` as an array (worlds,) in which the compiler does not see a scalar: see ``unit``."""
+    return one.reshape(1) if worlds == 1 else jnp.minimum(one, jnp.asarray(1.0 + np.arange(worlds) % 2, one.dtype))
 
 
 def materialise(tree, one: jax.Array | float | None = 1.0):

@@ -172,3 +172,22 @@ def test_compiled_flops_stay_near_the_written_ones(name):
     lowered = step.lower(model, state)
     written, compiled = lowered.cost_analysis()["flops"], lowered.compile().cost_analysis()["flops"]
     assert np.isfinite(compiled) and compiled < RECOMPUTED[name] * written, compiled / written
+
+
+def test_what_a_compiled_function_closes_over_is_computed_once_too():
+    """XLA knows numbers that are closed over; a division by a one that it knows it takes away (see ``materialise``)."""
+    model, state = rbd.build(REDUCED["box on a plane"][0], method="fast")
+    push = np.zeros((1, 3), np.float32)
+    roll = lambda model, state, force: rbd.rollout(model, state, 4, every=4, control=rbd.Wrench(force))[0]
+
+    def divisions(f, *args):
+        return jax.jit(f).lower(*args).compile().as_text().count(" divide(")
+
+    everything = divisions(roll, model, state, push)
+    assert everything > 50
+    for some in (
+        divisions(lambda vel: roll(model, state.replace(vel=vel), push), state.vel),
+        divisions(lambda friction: roll(model.replace(friction=friction), state, push), model.friction),
+        divisions(lambda force: roll(model, state, force), push),
+    ):
+        assert some > 0.7 * everything, (some, everything)

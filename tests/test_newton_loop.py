@@ -31,7 +31,7 @@ def test_block_factorisation(filled):
     b = rng.normal(size=(n, m, worlds))
     with jax.enable_x64(True):
         h = block_ldl.Blocks(*map(jnp.asarray, (diagonal, b, below, flags)))
-        x = jax.jit(lambda h: one_function(block_ldl.solve)(h, opaque_one(h.b)))(h)
+        x = jax.jit(lambda h: one_function(block_ldl.solve)(h, opaque_one(h.b, h.b.dtype)))(h)
     dense = full.reshape(worlds, n * m, n * m)
     exact = np.linalg.solve(dense, b.transpose(2, 0, 1).reshape(worlds, n * m, 1))
     np.testing.assert_allclose(
