@@ -74,9 +74,15 @@ def points(rows: Rows, dtype) -> jax.Array:
     return jnp.maximum(summed(rows.live.astype(dtype)), 1)
 
 
-def recovery(phi: jax.Array, problem, fraction, push_speed: float) -> jax.Array:
-    """Target velocity: a gap may close exactly; a ``fraction`` of an overlap is taken back a step [m/s]."""
+def recovery(phi: jax.Array, problem, fraction, push_speed: float, deep: tuple[float, float] | None = None) -> jax.Array:
+    """Target velocity [m/s]: a gap may close exactly; a ``fraction`` of an overlap is taken back a step, at up to
+    ``push_speed``. deep: a speed [m/s] and a smaller fraction, of what is beyond the overlap that gives that speed.
+    """
     # products with the reciprocal, as XLA makes them of a quotient in one program and not in another
     gap = -phi * (1.0 / problem.h)
     back = gap if problem.nominal is None else -phi * (1.0 / problem.nominal)
-    return jnp.where(phi <= 0, jnp.minimum(fraction * back, push_speed), gap)
+    speed = fraction * back
+    if deep is not None:
+        slow, part = deep
+        speed = jnp.minimum(speed, part * back + (1.0 - part / fraction) * slow)
+    return jnp.where(phi <= 0, jnp.minimum(speed, push_speed), gap)

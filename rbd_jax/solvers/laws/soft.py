@@ -26,7 +26,9 @@ class Soft(ContactModel):
 
     stiffness, damping_ratio: of pairs of one point, as spheres have. push_speed: bound of the
     speed at which a contact resolves overlap [m/s]; bodies part at up to ``EXIT`` times this.
-    face: spring of pairs of several points, as boxes have. stacked: the same where bodies may touch each other, with
+    face: spring of pairs of several points, as boxes have. deep: of these a speed [m/s] and a part: overlap is taken back
+    at that speed as the spring says, of what is beyond only that part a step (None: no such bound). What a box sinks into
+    a plane where it hits it would be given back at once, as energy; at rest it overlaps by far less. stacked: the same where bodies may touch each other, with
     fixed geometry and between bodies; sweeps are slowest there, and with three or four the former may be stiffer.
     """
 
@@ -34,6 +36,7 @@ class Soft(ContactModel):
     damping_ratio: float = 30.0
     push_speed: float = 2.0
     face: tuple[float, float] = (0.6, 5.0)
+    deep: tuple[float, float] | None = (0.003, 0.03)
     stacked: tuple[tuple[float, float], tuple[float, float]] = ((0.25, 10.0), (0.25, 10.0))
 
     name = "soft"
@@ -43,7 +46,7 @@ class Soft(ContactModel):
     def uniform(cls, stiffness: float, damping_ratio: float) -> Soft:
         """The same spring for all pairs."""
         spring = stiffness, damping_ratio
-        return cls(*spring, face=spring, stacked=(spring, spring))
+        return cls(*spring, face=spring, deep=None, stacked=(spring, spring))
 
     def spring(self, rows, problem) -> tuple[float, float]:
         """Stiffness and damping ratio of a group of pairs."""
@@ -57,7 +60,8 @@ class Soft(ContactModel):
         stiffness, damping_ratio = self.spring(rows, problem)
         om = 2.0 * math.pi * stiffness
         both = 2.0 * damping_ratio + om
-        vhat = recovery(rows.phi, problem, om / both, self.push_speed)
+        deep = None if rows.slots == 1 or problem.stacked else self.deep
+        vhat = recovery(rows.phi, problem, om / both, self.push_speed, deep)
         return Law(vhat, jnp.where(rows.phi <= 0, w / (om * both), 0.0))
 
 
