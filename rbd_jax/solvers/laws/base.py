@@ -74,7 +74,9 @@ def points(rows: Rows, dtype) -> jax.Array:
     return jnp.maximum(summed(rows.live.astype(dtype)), 1)
 
 
-def recovery(phi: jax.Array, problem, fraction, push_speed: float, deep: tuple[float, float] | None = None) -> jax.Array:
+def recovery(
+    phi: jax.Array, problem, fraction, push_speed: float, deep: tuple[float, float] | None = None
+) -> jax.Array:
     """Target velocity [m/s]: a gap may close exactly; a ``fraction`` of an overlap is taken back a step, at up to
     ``push_speed``. deep: a speed [m/s] and a smaller fraction, of what is beyond the overlap that gives that speed.
     """

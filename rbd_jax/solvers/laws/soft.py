@@ -26,10 +26,11 @@ class Soft(ContactModel):
 
     stiffness, damping_ratio: of pairs of one point, as spheres have. push_speed: bound of the
     speed at which a contact resolves overlap [m/s]; bodies part at up to ``EXIT`` times this.
-    face: spring of pairs of several points, as boxes have. deep: of these a speed [m/s] and a part: overlap is taken back
-    at that speed as the spring says, of what is beyond only that part a step (None: no such bound). What a box sinks into
-    a plane where it hits it would be given back at once, as energy; at rest it overlaps by far less. stacked: the same where bodies may touch each other, with
-    fixed geometry and between bodies; sweeps are slowest there, and with three or four the former may be stiffer.
+    face: spring of pairs of several points, as boxes have. deep: of these a speed [m/s] and a part: overlap is taken
+    back at that speed as the spring says, of what is beyond only that part a step; None: no such bound. What a box
+    sinks in where it hits would else be given back at once, as energy; at rest it overlaps by far less.
+    stacked: the spring where bodies may touch each other, with fixed geometry and between bodies; sweeps are slowest
+    there, and with three or four the former may be stiffer.
     """
 
     stiffness: float = 0.75
