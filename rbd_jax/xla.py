@@ -23,13 +23,14 @@ from jax.interpreters.partial_eval import dce_jaxpr
 
 
 def opaque_one(tree, dtype) -> jax.Array:
-    """A scalar 1 that the compiler cannot fold, as long as it does not know one array of ``tree``, any numbers.
+    """A scalar 1 that the compiler cannot fold, as long as it does not know one real array of ``tree``.
 
     Of what a compiled function closes over it knows all numbers: to take one that it happens to know is to lose what
     ``materialise`` is for.
     """
-    first = [jax.lax.stop_gradient(c).ravel()[0].astype(dtype) for c in jax.tree.leaves(tree) if jnp.size(c)]
-    total = functools.reduce(jnp.add, first)
+    real = lambda c: jnp.size(c) and any(jnp.issubdtype(c.dtype, kind) for kind in (jnp.floating, jnp.integer))
+    known = [c for c in map(jnp.asarray, jax.tree.leaves(tree)) if real(c)]  # others are no numbers, as random keys
+    total = functools.reduce(jnp.add, [jax.lax.stop_gradient(c).ravel()[0].astype(dtype) for c in known])
     return jnp.exp(0.0 * jnp.where(jnp.isfinite(total), total, 0.0))
 
 
