@@ -1,6 +1,6 @@
 """World-steps per second beside ``mujoco.rollout``, compile time, and the error at that speed.
 
-    PYTHONPATH=. python benchmarks/throughput.py                 (about 12 minutes on 2 cores)
+    PYTHONPATH=. python benchmarks/throughput.py                 (about 7 minutes on 2 cores)
     PYTHONPATH=. python benchmarks/throughput.py --smoke --out /tmp/x
     PYTHONPATH=. python benchmarks/throughput.py --devices 2     (two host devices instead of two threads)
 
