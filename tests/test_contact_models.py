@@ -1,8 +1,10 @@
 """Contact models with every solver: the overlap and the friction that the law of each says."""
 
 import dataclasses
+import types
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ import rbd_jax as rbd
 from rbd_jax.method import SWEPT
 from rbd_jax.solvers import TGS
 from rbd_jax.solvers.laws import Hertz, NearRigid, Soft, Spring
+from rbd_jax.solvers.laws.base import recovery
 
 G, H = 9.81, 1 / 240
 SOLVERS = ["tgs", "pgs", "newton_lagged", "newton_cone", "penalty"]
@@ -141,6 +144,14 @@ def test_what_a_tumbling_box_sinks_in_is_given_back_slowly():
         return np.diff(energy).max() / (G * half[0])
 
     assert rise(Soft()) < 1.5e-3 < 5e-3 < rise(Soft(deep=None))
+
+
+def test_a_spring_softer_than_what_deep_overlap_gives_back_stays_as_it_is():
+    """Soft(face=...) takes back less than ``deep`` says: a steeper line above it would pull at small overlaps."""
+    problem = types.SimpleNamespace(h=H, nominal=None)
+    phi = jnp.array([-0.01, -1e-3, -1e-5, 0.0, 0.01])
+    with_deep, without = (recovery(phi, problem, 0.01, 2.0, deep) for deep in ((0.003, 0.03), None))
+    np.testing.assert_array_equal(with_deep, without)
 
 
 def test_boxes_that_are_pushed_seldom_rock():

@@ -78,13 +78,13 @@ def recovery(
     phi: jax.Array, problem, fraction, push_speed: float, deep: tuple[float, float] | None = None
 ) -> jax.Array:
     """Target velocity [m/s]: a gap may close exactly; a ``fraction`` of an overlap is taken back a step, at up to
-    ``push_speed``. deep: a speed [m/s] and a smaller fraction, of what is beyond the overlap that gives that speed.
+    ``push_speed``. deep: a speed [m/s] and a fraction, of what is beyond the overlap that gives that speed, if smaller.
     """
     # products with the reciprocal, as XLA makes them of a quotient in one program and not in another
     gap = -phi * (1.0 / problem.h)
     back = gap if problem.nominal is None else -phi * (1.0 / problem.nominal)
     speed = fraction * back
     if deep is not None:
-        slow, part = deep
+        slow, part = deep[0], min(deep[1], fraction)
         speed = jnp.minimum(speed, part * back + (1.0 - part / fraction) * slow)
     return jnp.where(phi <= 0, jnp.minimum(speed, push_speed), gap)
